@@ -1,0 +1,25 @@
+"""navrep-data: datasets and pretrained models for robots that navigate among people.
+
+Sub-packages are imported on first use, so that ``import navrep_data`` stays light (no torch, no numba).
+"""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+from navrep_data._version import __version__
+
+_LAZY = ("datasets", "errors", "generate", "io", "observations", "schema", "shards", "sim", "testing")
+
+__all__ = ["__version__", *_LAZY]
+
+
+def __getattr__(name: str) -> ModuleType:
+    if name in _LAZY:
+        return importlib.import_module(f"navrep_data.{name}")
+    raise AttributeError(f"module 'navrep_data' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,89 @@
+"""``navrep-data generate``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from navrep_data.cli._common import print_json, say, say_err, show_progress
+
+if TYPE_CHECKING:
+    from navrep_data.generate import GenerateResult
+
+
+def _cores() -> int:
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS
+        return os.cpu_count() or 1
+
+
+def generate_command(
+    env: Annotated[str, typer.Option("--env", help="Environment.")] = "soadrl",
+    n: Annotated[int, typer.Option("--n", help="Number of sequences of --length rows.")] = 100,
+    out: Annotated[Path | None, typer.Option("--out", help="Dataset folder.", show_default="data/<env>")] = None,
+    seed: Annotated[int, typer.Option("--seed", help="Same seed and settings, same bytes.")] = 0,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Processes.", show_default="number of cores")
+    ] = None,
+    length: Annotated[int, typer.Option("--length", help="Rows per sequence (0.2 s each).")] = 1000,
+    physics: Annotated[
+        str | None, typer.Option("--physics", help="How worlds behave.", show_default="consistent")
+    ] = None,
+    humans: Annotated[
+        int | None, typer.Option("--humans", help="Mean number of humans; an episode has half to 1.5 times as many.", show_default="the environment's")
+    ] = None,
+    obstacles: Annotated[
+        int | None, typer.Option("--obstacles", help="Most squares, and most walls, in an episode.", show_default="the environment's")
+    ] = None,
+    legs: Annotated[bool, typer.Option("--legs/--trunk", help="What the lidar sees of a human.")] = True,
+    policy: Annotated[
+        str, typer.Option("--policy", help="orca, goal-momentum, random-momentum, constant-velocity, or your own module:function.")
+    ] = "orca",
+    policy_batch: Annotated[
+        int, typer.Option("--policy-batch", help="Batch size that a module:function policy always sees.")
+    ] = 64,
+    shard_size: Annotated[
+        int | None, typer.Option("--shard-size", help="Sequences per shard.", show_default="20,000 rows' worth")
+    ] = None,
+    scan_dtype: Annotated[
+        str | None, typer.Option("--scan-dtype", help="uint16 (millimetres) or float32 (metres).", show_default="uint16")
+    ] = None,
+    rings: Annotated[bool, typer.Option("--rings/--no-rings", help="Store the rings column.")] = True,
+    humans_column: Annotated[
+        bool, typer.Option("--humans-column/--no-humans-column", help="Store the humans behind each scan.")
+    ] = True,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
+) -> None:
+    """Simulate robots among people and write a dataset of lidar sequences.
+
+    Run the same command again to go on after an interruption, or with a larger --n to extend a dataset.
+    """  # fmt: skip
+    from navrep_data.generate import generate
+
+    result = generate(
+        env=env, n=n, out=out, seed=seed, workers=_cores() if workers is None else workers, length=length,
+        physics=physics, humans=humans, obstacles=obstacles, legs=legs, policy=policy, policy_batch=policy_batch,
+        shard_size=shard_size, scan_dtype=scan_dtype, rings=rings, humans_column=humans_column,
+        progress=show_progress(), report=say_err if as_json else say,
+    )  # fmt: skip
+    if as_json:
+        print_json(result.to_dict())
+    else:
+        _print_summary(result)
+
+
+def _print_summary(result: GenerateResult) -> None:
+    episodes = max(1, sum(result.outcomes.values()))
+    outcomes = ", ".join(f"{name} {100 * count / episodes:.0f} %" for name, count in result.outcomes.items() if count)
+    say(
+        f"{result.root}: {result.sequences} sequences, {result.rows:,} rows, {result.shards} shards, "
+        f"{result.bytes / 1e6:,.1f} MB ({result.bytes / result.rows / 1e3:.2f} kB/row)"
+    )
+    if result.new_rows:
+        say(f"made {result.new_rows:,} rows in {result.seconds:.1f} s: {result.rows_per_s:,.0f} rows/s")
+    say(f"{episodes:,} episodes: {outcomes}")
+    say(f"next: navrep-data info {result.root}")

@@ -1,0 +1,29 @@
+"""``navrep-data import-npz``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from navrep_data.cli._common import print_json, say
+
+
+def import_npz_command(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="The original's *_scans_robotstates_actions_rewards_dones.npz.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Dataset folder, new or empty.")],
+    env: Annotated[str, typer.Option("--env", help="Name to record as the environment.")] = "imported",
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Convert sequences recorded by the original NavRep into a dataset."""
+    from navrep_data.datasets import import_npz
+
+    manifest = import_npz(files, out, env=env)
+    if as_json:
+        print_json({"rows": manifest.rows, "sequences": manifest.sequences, "shards": len(manifest.shards), "bytes": manifest.bytes})
+    else:
+        say(f"{out}: {manifest.sequences} sequences, {manifest.rows:,} rows, {manifest.bytes / 1e6:.1f} MB")
+        say(f"next: navrep-data info {out}")

@@ -1,0 +1,11 @@
+"""Datasets for PyTorch over shards: single frames, windows, a stream of windows; import of the original's files."""
+
+from __future__ import annotations
+
+from navrep_data.datasets._batch import FIELDS
+from navrep_data.datasets.npz import import_npz
+from navrep_data.datasets.scans import ScanDataset
+from navrep_data.datasets.sequences import SequenceDataset
+from navrep_data.datasets.streaming import StreamingSequenceDataset
+
+__all__ = ["FIELDS", "ScanDataset", "SequenceDataset", "StreamingSequenceDataset", "import_npz"]

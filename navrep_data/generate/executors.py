@@ -1,0 +1,119 @@
+"""Run shard tasks here or in worker processes; results come back in any order."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from multiprocessing import get_context
+from pickle import PicklingError
+
+from navrep_data.errors import PolicyError, WorkerDiedError
+from navrep_data.generate.worker import DatasetSpec, ShardTask, make_shard, rollout_of, run_task, start_worker
+from navrep_data.shards import ShardEntry
+
+# A worker that somebody kills is replaced; a task that kills its worker this often is at fault itself.
+MAX_RESTARTS = 3
+POLL_SECONDS = 0.2
+
+Finished = tuple[ShardTask, ShardEntry]
+"""A finished task and what to list."""
+
+
+class LocalExecutor:
+    """Run shard tasks with `workers` processes (1 = in this one).
+
+    Parameters
+    ----------
+    spec : DatasetSpec
+        The dataset.
+    workers : int
+        Number of processes.
+    """
+
+    def __init__(self, spec: DatasetSpec, workers: int) -> None:
+        self.spec = spec
+        self.workers = workers
+        self._here = 0
+        self._finished = 0
+        self._counters = get_context("spawn").RawArray("q", 2 * workers)
+
+    @property
+    def rows_made(self) -> int:
+        """Rows simulated so far, those of unfinished shards included."""
+        return self._here + self._finished + sum(self._counters)
+
+    def run(self, tasks: Sequence[ShardTask]) -> Iterator[Finished | None]:
+        """Yield each finished task, and None several times a second while waiting."""
+        if not tasks:
+            return
+        yield from self._run_here(tasks) if self.workers == 1 else self._run_pool(list(tasks))
+
+    def _run_here(self, tasks: Sequence[ShardTask]) -> Iterator[Finished | None]:
+        rollout = rollout_of(self.spec)
+        due = time.monotonic()
+
+        def report(rows: int) -> None:
+            self._here += rows
+
+        for task in tasks:
+            entry = make_shard(self.spec, task, rollout, report)
+            yield task, entry
+            if time.monotonic() - due > POLL_SECONDS:
+                due = time.monotonic()
+                yield None
+
+    def _run_pool(self, tasks: list[ShardTask]) -> Iterator[Finished | None]:
+        restarts = 0
+        while tasks:
+            done: set[int] = set()
+            try:
+                for finished in self._run_once(tasks):
+                    if finished is not None:
+                        done.add(finished[0].index)
+                    yield finished
+                return
+            except BrokenProcessPool:
+                tasks = [task for task in tasks if task.index not in done]
+                restarts = 0 if done else restarts + 1
+                if restarts > MAX_RESTARTS:
+                    raise WorkerDiedError(
+                        f"Worker processes died {restarts} times before finishing shard {tasks[0].index} (killed, or out of "
+                        "memory?). What was finished is intact; run the same command again, perhaps with fewer --workers."
+                    ) from None
+                for slot in range(len(self._counters)):
+                    self._counters[slot] = 0
+
+    def _run_once(self, tasks: Sequence[ShardTask]) -> Iterator[Finished | None]:
+        pool = ProcessPoolExecutor(
+            self.workers, mp_context=get_context("spawn"), initializer=start_worker, initargs=(self.spec, self._counters)
+        )
+        free = list(range(len(self._counters)))
+        running: dict[Future[ShardEntry], ShardTask] = {}
+        waiting = iter(tasks)
+        try:
+            while True:
+                while free and (task := next(waiting, None)) is not None:
+                    task = replace(task, slot=free.pop())
+                    running[pool.submit(run_task, task)] = task
+                if not running:
+                    return
+                for future in wait(running, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED).done:
+                    task = running.pop(future)
+                    entry = future.result()
+                    self._finished += entry.rows
+                    self._counters[task.slot] = 0
+                    free.append(task.slot)
+                    yield task, entry
+                yield None
+        except (PicklingError, AttributeError, TypeError) as error:
+            if self.spec.policy.function is None:
+                raise
+            raise PolicyError(
+                f"The policy cannot be sent to worker processes ({error}). Expected a function or object of an importable "
+                "module; use workers=1 or give its name as module:function."
+            ) from error
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,221 @@
+"""What a run will do, decided and checked before anything is simulated or written."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import sys
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from navrep_data._version import __version__
+from navrep_data.errors import (
+    ConfigError,
+    DatasetMismatchError,
+    DiskSpaceError,
+    FolderInUseError,
+    FolderNotWritableError,
+)
+from navrep_data.generate.policy import PolicySpec
+from navrep_data.generate.worker import STAGING, DatasetSpec
+from navrep_data.io import PART_SUFFIX
+from navrep_data.schema import COLUMNS, UINT16_RANGE_LIMIT
+from navrep_data.shards import LOCK_FILE, MANIFEST_FILE, MAX_SHARD_BYTES, Manifest, estimate_bytes
+from navrep_data.sim import RolloutSettings, SimConfig
+
+DEFAULT_SHARD_ROWS = 20_000
+MAX_SEQUENCES = 2**31 - 1
+MAX_LENGTH = 100_000
+# An estimate of compressed size is good to a few per cent; ask for a little more.
+DISK_MARGIN = 1.1
+_GENERATED_COLUMNS = tuple(name for name in COLUMNS if not name.startswith("leading_"))
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked for, checked field by field."""
+
+    spec: DatasetSpec
+    n: int
+    shard_size: int
+    command: str
+
+    @property
+    def rows(self) -> int:
+        """Rows of the finished dataset."""
+        return self.n * self.spec.settings.length
+
+    @property
+    def bytes(self) -> int:
+        """Estimated bytes of the finished dataset."""
+        return int(self.rows * bytes_per_row(self.spec))
+
+
+def bytes_per_row(spec: DatasetSpec) -> float:
+    """Return the estimated compressed size of a row of this dataset [bytes]."""
+    rows = 1_000_000
+    estimate = estimate_bytes(
+        spec.columns, rows, n_rays=spec.config.sensor.n_rays, scan_dtype=spec.settings.scan_dtype,
+        max_humans=spec.config.max_humans,
+    )  # fmt: skip
+    return estimate / rows
+
+
+def check_count(name: str, value: Any, low: int, high: int) -> int:
+    """Return `value` if it is a whole number in [low, high], else raise a ConfigError that names the flag."""
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise ConfigError(f"--{name} is {value!r}, expected a whole number from {low} to {high:,}.")
+    return value
+
+
+def check_settings(config: SimConfig, length: int, scan_dtype: str | None, rings: bool, humans: bool) -> RolloutSettings:
+    """Return the settings of the rows; chooses float32 scans by itself where millimetres do not fit 16 bits."""
+    far = config.sensor.range_max > UINT16_RANGE_LIMIT
+    if scan_dtype not in (None, "uint16", "float32"):
+        raise ConfigError(f"--scan-dtype is {scan_dtype!r}, expected uint16 (millimetres) or float32 (metres).")
+    if far and scan_dtype == "uint16":
+        raise ConfigError(
+            f"--scan-dtype uint16 holds ranges up to {UINT16_RANGE_LIMIT:g} m, but range_max is {config.sensor.range_max:g} m; "
+            "use float32."
+        )
+    chosen = scan_dtype or ("float32" if far else "uint16")
+    return RolloutSettings(check_count("length", length, 1, MAX_LENGTH), chosen, rings, humans and config.max_humans > 0)
+
+
+def make_request(
+    root: Path, config: SimConfig, settings: RolloutSettings, policy: PolicySpec, seed: int, n: int,
+    shard_size: int | None, command: str,
+) -> Request:  # fmt: skip
+    """Return the checked request; chooses the shard size where none is given."""
+    check_count("n", n, 1, MAX_SEQUENCES)
+    columns = tuple(
+        name
+        for name in _GENERATED_COLUMNS
+        if (name != "rings" or settings.rings) and (name != "humans" or settings.humans)
+    )
+    spec = DatasetSpec(root, config, settings, policy, seed, columns)
+    largest = max(1, int(MAX_SHARD_BYTES / (bytes_per_row(spec) * settings.length)))
+    if shard_size is None:
+        shard_size = min(largest, max(policy.batch, DEFAULT_SHARD_ROWS // settings.length, 1))
+    elif check_count("shard-size", shard_size, 1, MAX_SEQUENCES) > largest:
+        raise ConfigError(
+            f"--shard-size is {shard_size}, expected at most {largest} sequences of {settings.length} rows: a shard is built in "
+            f"memory and may take {MAX_SHARD_BYTES >> 20} MiB."
+        )
+    return Request(spec, n, shard_size, command)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that the bytes of a dataset depend on; no time, host or speed."""
+    import llvmlite.binding as llvm
+
+    names = ("numpy", "numba", "llvmlite", "h5py", "isal")
+    return {
+        "navrep_data": __version__,
+        "python": f"{sys.version_info.major}.{sys.version_info.minor}",
+        **{name: version(name) for name in names},
+        "machine": platform.machine(),
+        "cpu": str(llvm.get_host_cpu_name()),
+    }
+
+
+def new_manifest(request: Request) -> Manifest:
+    """Return the manifest of a dataset without shards."""
+    spec = request.spec
+    return Manifest(
+        env=spec.config.env,
+        physics=spec.config.physics,
+        seed=spec.seed,
+        length=spec.settings.length,
+        planned=request.n,
+        shard_size=request.shard_size,
+        scan_dtype=spec.settings.scan_dtype,
+        columns=spec.columns,
+        max_humans=spec.config.max_humans if spec.settings.humans else 0,
+        sensor=spec.config.sensor,
+        config=spec.config.to_dict(),
+        policy=spec.policy.to_dict(),
+        versions=versions(),
+        command=request.command,
+    )
+
+
+def check_folder(root: Path) -> None:
+    """Make sure that `root` is a folder of ours, empty, or can be made.
+
+    Raises
+    ------
+    FolderInUseError
+        If it holds anything that is not a dataset.
+    FolderNotWritableError
+        If it cannot be made.
+    """
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise FolderInUseError(f"{root} is or lies under a file, expected a folder; choose another --out.") from None
+    except OSError as error:
+        raise FolderNotWritableError(f"Cannot make the folder {root}: {error.strerror}; choose another --out.") from error
+    if (root / MANIFEST_FILE).exists():
+        return
+    own = {LOCK_FILE, STAGING}
+    other = sorted(p.name for p in root.iterdir() if p.name not in own and not p.name.endswith(PART_SUFFIX))
+    if other:
+        raise FolderInUseError(
+            f"{root} holds something else ({', '.join(other[:3])}{', ...' if len(other) > 3 else ''}) and no manifest.json; "
+            "expected an empty or new folder, or a dataset to go on with. Choose another --out."
+        )
+
+
+def check_same(old: Manifest, request: Request, explicit_shard_size: bool) -> None:
+    """Make sure that an existing dataset was made with the settings of this request, all but n.
+
+    Raises
+    ------
+    DatasetMismatchError
+        Naming the first field that differs.
+    """
+    new = new_manifest(request)
+    pairs: list[tuple[str, Any, Any]] = [
+        ("env", old.env, new.env),
+        ("physics", old.physics, new.physics),
+        ("seed", old.seed, new.seed),
+        ("length", old.length, new.length),
+        ("scan_dtype", old.scan_dtype, new.scan_dtype),
+        ("policy", old.policy.get("name"), new.policy.get("name")),
+        ("policy_batch", old.policy.get("batch"), new.policy.get("batch")),
+        ("columns", ", ".join(old.columns), ", ".join(new.columns)),
+    ]
+    pairs += [(key, old.config.get(key), value) for key, value in new.config.items()]
+    if explicit_shard_size:
+        pairs.append(("shard_size", old.shard_size, new.shard_size))
+    for field, seen, asked in pairs:
+        if seen != asked:
+            raise DatasetMismatchError(
+                f"{request.spec.root} was made with {field}={seen}, asked for {field}={asked}; "
+                "repeat the old setting to go on with it, or choose another --out."
+            )
+    if request.n < old.planned:
+        raise DatasetMismatchError(
+            f"{request.spec.root} was made with n={old.planned}, asked for n={request.n}; a dataset only grows: "
+            "give the same --n or a larger one, or choose another --out."
+        )
+
+
+def check_space(request: Request, done_rows: int) -> None:
+    """Make sure that what is still to be written fits the disk.
+
+    Raises
+    ------
+    DiskSpaceError
+        Naming both sizes.
+    """
+    needed = int((request.rows - done_rows) * bytes_per_row(request.spec) * DISK_MARGIN)
+    free = shutil.disk_usage(request.spec.root).free
+    if needed > free:
+        raise DiskSpaceError(
+            f"{request.spec.root} has {free / 1e9:.2f} GB free, about {needed / 1e9:.2f} GB are needed for "
+            f"{request.n} sequences; free some space, choose another --out or a smaller --n."
+        )

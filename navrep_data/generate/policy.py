@@ -1,0 +1,108 @@
+"""From the name of a policy to something that rolls out sequences."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from navrep_data.errors import PolicyError
+from navrep_data.sim import (
+    SCRIPTED,
+    CallableRollout,
+    PolicyFunction,
+    RolloutSettings,
+    ScriptedPolicy,
+    ScriptedRollout,
+    SimConfig,
+)
+
+
+@dataclass(frozen=True)
+class PolicySpec:
+    """A policy as the manifest records it.
+
+    Attributes
+    ----------
+    name : str
+        Scripted name, ``module:function``, or the qualified name of a callable that was passed in.
+    batch : int
+        Sequences per group for Python policies, 1 for scripted ones.
+    function : callable or None
+        The callable itself where one was passed in.
+    """
+
+    name: str = "orca"
+    batch: int = 1
+    function: PolicyFunction | None = None
+
+    @property
+    def scripted(self) -> bool:
+        """True for policies that run inside the kernels."""
+        return self.function is None and ":" not in self.name
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what the manifest stores."""
+        if self.scripted:
+            return {**ScriptedPolicy(self.name).to_dict(), "batch": 1}
+        return {"name": self.name, "batch": self.batch}
+
+
+def make_policy(policy: str | PolicyFunction, batch: int) -> PolicySpec:
+    """Return the spec of a policy given by name, as ``module:function`` or as a callable.
+
+    Raises
+    ------
+    UnknownNameError
+        If a name is neither scripted nor ``module:function``.
+    PolicyError
+        If the batch size cannot be used.
+    """
+    if isinstance(batch, bool) or not isinstance(batch, int) or not 1 <= batch <= 4096:
+        raise PolicyError(f"policy_batch is {batch!r}, expected a whole number from 1 to 4096.")
+    if callable(policy):
+        kind = policy if hasattr(policy, "__qualname__") else type(policy)
+        return PolicySpec(f"{kind.__module__}:{kind.__qualname__}", batch, policy)
+    if ":" in policy:
+        return PolicySpec(policy, batch)
+    return PolicySpec(ScriptedPolicy(policy).name)
+
+
+def load_callable(name: str) -> PolicyFunction:
+    """Import ``module:attribute``; the current folder is searched first, as ``python -m`` does.
+
+    Raises
+    ------
+    PolicyError
+        If the module or attribute cannot be imported or is not callable.
+    """
+    module_name, _, attribute = name.partition(":")
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        found: Any = importlib.import_module(module_name)
+        for part in attribute.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise PolicyError(
+            f"Policy {name!r} cannot be imported ({error}). Expected module:function, importable from {here}, or one of: "
+            f"{', '.join(SCRIPTED)}."
+        ) from error
+    if isinstance(found, type):
+        found = found()
+    if not callable(found):
+        raise PolicyError(f"Policy {name!r} is a {type(found).__name__}, expected a callable policy(scan, robot_state).")
+    return found  # type: ignore[no-any-return]
+
+
+def make_rollout(
+    config: SimConfig, settings: RolloutSettings, policy: PolicySpec, seed: int
+) -> ScriptedRollout | CallableRollout:
+    """Return the object that makes this dataset's sequences."""
+    if policy.scripted:
+        return ScriptedRollout(config, settings, ScriptedPolicy(policy.name), seed)
+    function = policy.function if policy.function is not None else load_callable(policy.name)
+    return CallableRollout(config, settings, function, seed, policy.batch)

@@ -1,0 +1,154 @@
+"""What a worker process does: one shard from its sequence range to its place on disk."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from multiprocessing import parent_process
+from pathlib import Path
+from typing import Any
+
+from navrep_data.generate.policy import PolicySpec, make_rollout
+from navrep_data.shards import ShardEntry, ShardWriter, publish
+from navrep_data.sim import CallableRollout, RolloutSettings, ScriptedRollout, SimConfig
+
+
+@dataclass(frozen=True)
+class DatasetSpec:
+    """Everything that determines the bytes of a dataset's shards, and where they go."""
+
+    root: Path
+    config: SimConfig
+    settings: RolloutSettings
+    policy: PolicySpec
+    seed: int
+    columns: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ShardTask:
+    """One shard to make: its number, its sequences [first, stop), and the counter to report rows in."""
+
+    index: int
+    first: int
+    stop: int
+    slot: int = 0
+    staged: bool = False
+
+
+STAGING = ".staging"
+"""Where a shard that replaces a shorter one waits until the manifest has let go of the old one."""
+
+_state: dict[str, Any] = {}
+
+
+def start_worker(spec: DatasetSpec, counters: Any) -> None:
+    """Prepare a worker process: the driver handles Ctrl-C, and no worker outlives its driver."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=_exit_with, args=(parent,), daemon=True).start()
+    _state["spec"] = spec
+    _state["counters"] = counters
+
+
+def _exit_with(parent: Any) -> None:
+    """Wait for the driver's end. Only a SIGKILL gets here: the pool cannot tell its workers of that by itself."""
+    parent.join()
+    os._exit(1)
+
+
+def run_task(task: ShardTask) -> ShardEntry:
+    """Make one shard in a worker process that :func:`start_worker` has prepared."""
+    if "rollout" not in _state:
+        _state["rollout"] = rollout_of(_state["spec"])
+    counters = _state["counters"]
+    made = 0
+
+    def report(rows: int) -> None:
+        nonlocal made
+        made += rows
+        counters[task.slot] = made
+
+    return make_shard(_state["spec"], task, _state["rollout"], report)
+
+
+def rollout_of(spec: DatasetSpec) -> ScriptedRollout | CallableRollout:
+    """Return what simulates this dataset's sequences."""
+    return make_rollout(spec.config, spec.settings, spec.policy, spec.seed)
+
+
+def make_shard(
+    spec: DatasetSpec,
+    task: ShardTask,
+    rollout: ScriptedRollout | CallableRollout,
+    report: Callable[[int], None],
+) -> ShardEntry:
+    """Simulate, compress, hash and publish one shard.
+
+    Parameters
+    ----------
+    spec : DatasetSpec
+        The dataset.
+    task : ShardTask
+        Which of its shards.
+    rollout : ScriptedRollout or CallableRollout
+        From :func:`rollout_of`; reused between shards.
+    report : callable
+        Called with the number of rows after each sequence.
+
+    Returns
+    -------
+    ShardEntry
+        What the manifest lists.
+
+    Raises
+    ------
+    DiskSpaceError
+        If there is no room; what is in place stays as it was.
+    """
+    writer = _writer(spec, task.first)
+    for start in range(task.first, task.stop, rollout.batch):
+        group = range(start, min(start + rollout.batch, task.stop))
+        for columns, worlds in rollout.run(group):
+            writer.append(columns, worlds)
+            report(spec.settings.length)
+    root = spec.root / STAGING if task.staged else spec.root
+    root.mkdir(exist_ok=True)
+    return publish(root, task.index, writer.finish())
+
+
+def _writer(spec: DatasetSpec, first_sequence: int) -> ShardWriter:
+    return ShardWriter(
+        env=spec.config.env,
+        config=spec.config.to_dict(),
+        seed=spec.seed,
+        sensor=spec.config.sensor,
+        scan_dtype=spec.settings.scan_dtype,
+        columns=spec.columns,
+        max_humans=spec.config.max_humans,
+        length=spec.settings.length,
+        first_sequence=first_sequence,
+    )
+
+
+def seconds_per_row(spec: DatasetSpec) -> float:
+    """Return how long a row of a scripted policy takes here, simulated and compressed, after compiling [s].
+
+    The clock runs over one short sequence in memory; nothing is written.
+    """
+    short = replace(spec, settings=replace(spec.settings, length=min(spec.settings.length, 500)))
+    rollout = rollout_of(short)
+    seconds = 0.0
+    for sequence in (0, 1):  # the first one compiles
+        begun = time.perf_counter()
+        writer = _writer(short, sequence)
+        for columns, worlds in rollout.run([sequence]):
+            writer.append(columns, worlds)
+        writer.finish()
+        seconds = time.perf_counter() - begun
+    return seconds / short.settings.length

@@ -1,0 +1,162 @@
+"""Atomic writes, hashing and reading with bounds."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import platformdirs
+
+from navrep_data.errors import CorruptDataError, DatasetError, DiskSpaceError, FolderNotWritableError
+
+PART_SUFFIX = ".part"
+HASH_BLOCK = 1 << 20
+# A manifest of 100,000 shards is about 60 MB; anything larger is not one of ours.
+MAX_JSON_BYTES = 256 << 20
+# What the operating system says when there is no room: disk full, quota used up, file size limit.
+_NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_NOT_ALLOWED = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+
+
+def cache_dir() -> Path:
+    """Return the package's cache folder (not created): ``NAVREP_DATA_HOME`` or the platform's user cache.
+
+    Returns
+    -------
+    pathlib.Path
+        Absolute path.
+    """
+    home = os.environ.get("NAVREP_DATA_HOME")
+    return Path(home).expanduser().absolute() if home else Path(platformdirs.user_cache_dir("navrep-data"))
+
+
+def fsync_dir(folder: Path) -> None:
+    """Make renames inside `folder` survive a power cut (where the platform can)."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:  # Windows cannot open folders
+        return
+    try:
+        os.fsync(handle)
+    except OSError:  # some network file systems refuse; the rename itself has happened
+        pass
+    finally:
+        os.close(handle)
+
+
+def translate_os_error(error: OSError, path: Path) -> Exception:
+    """Turn an operating-system error while writing `path` into one that says what to do."""
+    if error.errno in _NO_ROOM:
+        return DiskSpaceError(
+            f"No room left while writing {path}: {error.strerror}. "
+            "What was finished is intact; free some space and run the same command again."
+        )
+    if error.errno in _NOT_ALLOWED:
+        return FolderNotWritableError(
+            f"Cannot write {path}: {error.strerror}. Expected a folder that this user may write; "
+            "choose another with --out or change its permissions."
+        )
+    return error
+
+
+def atomic_write_bytes(path: Path | str, data: bytes | memoryview) -> None:
+    """Write `data` so that `path` is afterwards either as before or complete: temp file, fsync, rename.
+
+    Parameters
+    ----------
+    path : path-like
+        Target; its folder must exist.
+    data : bytes-like
+        The whole content.
+
+    Raises
+    ------
+    DiskSpaceError
+        If there is no room. The temp file is removed, `path` is as it was.
+    FolderNotWritableError
+        If the folder cannot be written.
+    """
+    path = Path(path)
+    # unique per process: an orphan of a killed run must never write into our temp file
+    part = path.with_name(f".{path.name}.{os.getpid()}{PART_SUFFIX}")
+    try:
+        with open(part, "wb") as handle:
+            handle.write(data)
+            handle.flush()
+            os.fsync(handle.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise translate_os_error(error, path) from error
+    fsync_dir(path.parent)
+
+
+def json_bytes(value: Any) -> bytes:
+    """Return `value` as UTF-8 JSON in one fixed layout: keys as given, one-space indent, NaN refused."""
+    return (json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+
+def atomic_write_json(path: Path | str, value: Any) -> None:
+    """Write `value` as JSON by :func:`atomic_write_bytes`."""
+    atomic_write_bytes(path, json_bytes(value))
+
+
+def read_json(path: Path | str, max_bytes: int = MAX_JSON_BYTES) -> Any:
+    """Read a JSON file that may come from anywhere.
+
+    Parameters
+    ----------
+    path : path-like
+        File to read.
+    max_bytes : int
+        Larger files are refused before anything is read.
+
+    Raises
+    ------
+    DatasetError
+        If the file is too large.
+    CorruptDataError
+        If it is not valid JSON.
+    """
+    path = Path(path)
+    size = path.stat().st_size
+    if size > max_bytes:
+        raise DatasetError(f"{path} has {size:,} bytes, expected at most {max_bytes:,}: not a file of this package.")
+    try:
+        return json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise CorruptDataError(
+            f"{path} is not valid JSON ({error}). Expected a file written by navrep-data; get it again."
+        ) from error
+
+
+def safe_join(root: Path, name: str) -> Path:
+    """Return ``root / name`` for a relative POSIX `name` from outside, refusing whatever would leave `root`.
+
+    Raises
+    ------
+    CorruptDataError
+        If `name` is absolute, has a drive or backslash, or contains ``..``.
+    """
+    pure = PurePosixPath(name)
+    if not name or pure.is_absolute() or ".." in pure.parts or "\\" in name or ":" in name or "\0" in name:
+        raise CorruptDataError(f"File name {name!r} points outside the dataset; expected a relative path inside {root}.")
+    return root.joinpath(*pure.parts)
+
+
+def sha256_bytes(data: bytes | memoryview) -> str:
+    """Return the SHA-256 of `data` as 64 hex digits."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def sha256_file(path: Path | str) -> str:
+    """Return the SHA-256 of a file's content as 64 hex digits, read in blocks of 1 MiB."""
+    digest = hashlib.sha256()
+    with open(path, "rb", buffering=0) as handle:
+        while block := handle.read(HASH_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()

@@ -1,0 +1,151 @@
+"""Names, shapes, dtypes and units of everything that is stored: format version 1.
+
+Notes
+-----
+The on-disk columns follow RLDS step semantics: an episode of T actions has T + 1 rows, and the last row's action and
+reward are zero and mean nothing. Difference to the original's npz: there a row holds the action that *led to* it.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+FORMAT_NAME = "navrep-data"
+FORMAT_VERSION = 1
+
+N_RAYS = 1080
+# The original's ray table: linspace(0, 6.27543783188, 1080) (pepper_2d_simulator.py); a hair short of a full turn.
+ANGLE_SPAN = 6.27543783188
+RANGE_MAX = 25.0
+DT = 0.2
+RINGS_SHAPE = (64, 64)
+ROBOT_STATE_SIZE = 5
+ACTION_SIZE = 3
+HUMAN_FIELDS = ("x", "y", "vx", "vy", "radius", "visible")
+
+SCAN_SCALE = 0.001
+"""Metres per count of a uint16 scan."""
+UINT16_RANGE_LIMIT = 65.0
+"""Scans with a larger range_max [m] are stored as float32: 65.535 m is the end of uint16 millimetres."""
+
+
+class Event(enum.IntEnum):
+    """Why an episode ended; 0 on every row but the last."""
+
+    NONE = 0
+    GOAL = 1
+    COLLISION_HUMAN = 2
+    COLLISION_OBSTACLE = 3
+    TIMEOUT = 4
+    STUCK = 5
+    CUT = 6
+
+    @property
+    def label(self) -> str:
+        """Lower-case name as used in attributes, cards and tables."""
+        return self.name.lower()
+
+    @property
+    def terminal(self) -> bool:
+        """True where the task itself ended (goal or collision), False where the episode was only cut short."""
+        return self in (Event.GOAL, Event.COLLISION_HUMAN, Event.COLLISION_OBSTACLE)
+
+
+EVENT_NAMES = tuple(event.label for event in Event)
+
+
+@dataclass(frozen=True)
+class SensorContract:
+    """What a scan means; models refuse scans of another contract.
+
+    Attributes
+    ----------
+    n_rays : int
+        Number of rays.
+    angle_min : float
+        Angle of ray 0 [rad], robot frame, anticlockwise.
+    angle_increment : float
+        Angle between neighbouring rays [rad].
+    range_max : float
+        Range stored where a ray hits nothing [m].
+    dt : float
+        Time between rows [s].
+    """
+
+    n_rays: int = N_RAYS
+    angle_min: float = 0.0
+    angle_increment: float = ANGLE_SPAN / (N_RAYS - 1)
+    range_max: float = RANGE_MAX
+    dt: float = DT
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as plain JSON values."""
+        return asdict(self)
+
+    def covers_full_turn(self) -> bool:
+        """Return whether the rays go once around, to within two increments."""
+        return abs(self.n_rays * self.angle_increment - 2.0 * math.pi) < 2.0 * self.angle_increment
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a shard.
+
+    Attributes
+    ----------
+    name : str
+        HDF5 dataset name.
+    shape : tuple of int
+        Shape per row; -1 = the dataset's largest number of humans, -2 = the number of rays.
+    dtype : str
+        numpy dtype; ``"scan"`` = the dataset's scan dtype (uint16 or float32).
+    unit : str
+        Units, empty if none.
+    description : str
+        One line for attributes and cards.
+    wide : bool
+        True for columns stored in row chunks of their own; narrow ones have one chunk per sequence.
+    may_be_nan : bool
+        True where NaN is a legal value.
+    optional : bool
+        True where a dataset may lack it.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+    unit: str
+    description: str
+    wide: bool = False
+    may_be_nan: bool = False
+    optional: bool = False
+
+
+HUMANS_AXIS = -1
+RAYS_AXIS = -2
+
+COLUMNS: dict[str, Column] = {
+    c.name: c
+    for c in (
+        Column("scan", (RAYS_AXIS,), "scan", "mm or m", "lidar ranges, ray 0 straight ahead, anticlockwise; 0 = invalid", wide=True),
+        Column("rings", RINGS_SHAPE, "uint8", "", "polar occupancy, angle x radius: 0 free, 1 unknown, 2 occupied", wide=True, optional=True),
+        Column("robot_state", (ROBOT_STATE_SIZE,), "float32", "m, m, m/s, m/s, rad/s", "goal x, goal y, vx, vy, omega in the robot frame", may_be_nan=True),
+        Column("action", (ACTION_SIZE,), "float32", "m/s, m/s, rad/s", "body velocity command taken from this row's observation"),
+        Column("reward", (), "float32", "", "result of this row's action"),
+        Column("is_first", (), "bool", "", "first row of an episode"),
+        Column("is_last", (), "bool", "", "last row of an episode; its action and reward mean nothing"),
+        Column("is_terminal", (), "bool", "", "last row of an episode that ended in goal or collision"),
+        Column("event", (), "uint8", "", "why the episode ended, 0 except on its last row"),
+        Column("sequence", (), "int32", "", "sequence index in the dataset"),
+        Column("episode", (), "int32", "", "episode index within the sequence"),
+        Column("step", (), "int32", "", "row index within the episode"),
+        Column("robot_pose", (3,), "float32", "m, m, rad", "x, y, theta in the world frame; NaN where unknown", may_be_nan=True),
+        Column("robot_radius", (), "float32", "m", "robot radius; NaN where unknown", may_be_nan=True),
+        Column("humans", (HUMANS_AXIS, len(HUMAN_FIELDS)), "float32", "m, m, m/s, m/s, m, -", "x, y, vx, vy along the robot's axes, radius, visible; one slot per human per episode, NaN-padded", wide=True, may_be_nan=True, optional=True),
+        Column("leading_action", (ACTION_SIZE,), "float32", "m/s, m/s, rad/s", "action that led to this row (imports only)", optional=True),
+        Column("leading_reward", (), "float32", "", "reward that came with this row (imports only)", optional=True),
+    )
+}  # fmt: skip

@@ -1,0 +1,59 @@
+"""The on-disk format: write, read and verify shards; manifest, worlds files and dataset card. No torch."""
+
+from navrep_data.shards._layout import chunk_rows, column_order, estimate_bytes
+from navrep_data.shards.card import dataset_card
+from navrep_data.shards.entries import (
+    SPLIT_RULE,
+    SPLITS,
+    FileEntry,
+    ShardEntry,
+    default_splits,
+    shard_file,
+    split_of,
+    worlds_file,
+)
+from navrep_data.shards.folder import DatasetFolder, Episodes, info
+from navrep_data.shards.lock import LOCK_FILE, writer_lock
+from navrep_data.shards.manifest import CARD_FILE, MANIFEST_FILE, Manifest
+from navrep_data.shards.reader import Shard
+from navrep_data.shards.statistics import merge_statistics
+from navrep_data.shards.verify import Problem, VerifyReport, verify
+from navrep_data.shards.worlds import WORLD_FIELDS, EpisodeWorld, Worlds, read_worlds
+from navrep_data.shards.writer import MAX_SHARD_BYTES, ShardImage, ShardWriter, publish, sequence_hash
+
+__all__ = [
+    "CARD_FILE",
+    "LOCK_FILE",
+    "MANIFEST_FILE",
+    "MAX_SHARD_BYTES",
+    "SPLITS",
+    "SPLIT_RULE",
+    "WORLD_FIELDS",
+    "DatasetFolder",
+    "EpisodeWorld",
+    "Episodes",
+    "FileEntry",
+    "Manifest",
+    "Problem",
+    "Shard",
+    "ShardEntry",
+    "ShardImage",
+    "ShardWriter",
+    "VerifyReport",
+    "Worlds",
+    "chunk_rows",
+    "column_order",
+    "dataset_card",
+    "default_splits",
+    "estimate_bytes",
+    "info",
+    "merge_statistics",
+    "publish",
+    "read_worlds",
+    "sequence_hash",
+    "shard_file",
+    "split_of",
+    "verify",
+    "worlds_file",
+    "writer_lock",
+]

@@ -1,0 +1,111 @@
+"""One chunk of a column to bytes and back: HDF5's shuffle and deflate filters, computed by us.
+
+Notes
+-----
+The bytes are what HDF5's own filters 2 (shuffle) and 1 (deflate) accept, so that any HDF5 library reads them.
+Three things differ from what HDF5 would write itself: isal compresses about ten times faster than zlib; the
+byte planes of large chunks are separated by a flush, which gives each plane its own Huffman code (the low
+byte of a scan is nearly noise, the high byte nearly constant: 3 % smaller); and reading needs neither the
+HDF5 library nor its global lock.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from isal import isal_zlib
+
+DEFLATE_LEVEL = 2
+# Below this size a Huffman table per plane costs more than it saves.
+SPLIT_PLANE_BYTES = 16384
+# The stub calls it an instance; it is a class.
+_DAMAGED: Any = isal_zlib.error
+
+
+def _planes(block: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+    """Return the bytes of `block` as (itemsize, n): HDF5's shuffle."""
+    size = block.dtype.itemsize
+    if size == 2:  # twice as fast as the general way
+        flat = block.reshape(-1).view("<u2")
+        out = np.empty((2, flat.size), np.uint8)
+        np.bitwise_and(flat, 0xFF, out=out[0], casting="unsafe")
+        np.right_shift(flat, 8, out=out[1], casting="unsafe")
+        return out
+    return np.ascontiguousarray(block.reshape(-1).view(np.uint8).reshape(-1, size).T)
+
+
+def encode(block: npt.NDArray[Any]) -> bytes:
+    """Return `block` (C-contiguous, little-endian) shuffled and deflated.
+
+    Parameters
+    ----------
+    block : ndarray of shape (rows, ...)
+        One whole chunk.
+    """
+    if block.dtype.itemsize == 1:
+        return bytes(isal_zlib.compress(block.reshape(-1).view(np.uint8), DEFLATE_LEVEL))
+    planes = _planes(block)
+    if planes.shape[1] < SPLIT_PLANE_BYTES:
+        return bytes(isal_zlib.compress(planes, DEFLATE_LEVEL))
+    stream = isal_zlib.compressobj(DEFLATE_LEVEL)
+    parts = []
+    for plane in planes[:-1]:
+        parts += [stream.compress(plane), stream.flush(isal_zlib.Z_SYNC_FLUSH)]
+    parts += [stream.compress(planes[-1]), stream.flush()]
+    return b"".join(parts)
+
+
+def inflate(data: bytes, size: int) -> bytes:
+    """Return the `size` bytes that `data` inflates to, never holding more.
+
+    Raises
+    ------
+    ValueError
+        If `data` is damaged or holds another number of bytes.
+    """
+    stream = isal_zlib.decompressobj()
+    try:
+        # One byte more than wanted: lets the stream reach its checksum, and shows one that would go on.
+        plain: bytes = stream.decompress(data, size + 1)
+    except _DAMAGED as error:
+        raise ValueError(f"its compressed bytes are damaged ({error})") from error
+    if len(plain) != size or not stream.eof:
+        raise ValueError(f"it does not inflate to the expected {size} bytes")
+    return plain
+
+
+def unshuffle(
+    plain: bytes, dtype: np.dtype[Any], row_items: int, start: int, stop: int, shuffled: bool = True
+) -> npt.NDArray[Any]:
+    """Return rows [start, stop) of an inflated chunk as a new flat array.
+
+    Parameters
+    ----------
+    plain : bytes
+        The inflated chunk.
+    dtype : numpy.dtype
+        Stored dtype.
+    row_items : int
+        Items per row.
+    start, stop : int
+        Rows within the chunk.
+    shuffled : bool
+        Whether the shuffle filter was applied.
+    """
+    size = dtype.itemsize
+    first, last = start * row_items, stop * row_items
+    if size == 1 or not shuffled:
+        return np.frombuffer(plain, dtype, last - first, first * size).copy()
+    planes = np.frombuffer(plain, np.uint8).reshape(size, -1)[:, first:last]
+    if size == 2:
+        words = planes[1].astype(np.uint16)
+        words <<= 8
+        words |= planes[0]
+        decoded: npt.NDArray[Any] = words.view(dtype)
+        return decoded
+    out = np.empty((last - first, size), np.uint8)
+    for k in range(size):
+        out[:, k] = planes[k]
+    return out.reshape(-1).view(dtype)

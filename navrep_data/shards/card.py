@@ -1,0 +1,220 @@
+"""The dataset card: README.md of a dataset, as the Hugging Face Hub shows it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from navrep_data.schema import COLUMNS
+from navrep_data.shards._layout import VECTOR_COLUMNS, Layout, layouts
+from navrep_data.shards.entries import SPLITS
+from navrep_data.shards.manifest import Manifest
+
+_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
+_SIZES_LARGE = ((10_000_000, "1M<n<10M"), (100_000_000, "10M<n<100M"), (1_000_000_000, "100M<n<1B"))
+
+CITATION = """\
+@article{dugas2020navrep,
+  title   = {NavRep: Unsupervised Representations for Reinforcement Learning
+             of Robot Navigation in Dynamic Human Environments},
+  author  = {Dugas, Daniel and Nieto, Juan and Siegwart, Roland and Chung, Jen Jen},
+  journal = {arXiv preprint arXiv:2012.04406},
+  year    = {2020}
+}"""
+
+
+def _size_category(rows: int) -> str:
+    return next((name for limit, name in (*_SIZES, *_SIZES_LARGE) if rows < limit), "n>1B")
+
+
+def _front_matter(m: Manifest) -> str:
+    lines = [
+        "---",
+        "license: mit",
+        f"pretty_name: {json.dumps(f'navrep-data {m.env} ({m.physics} physics, seed {m.seed})')}",
+        "task_categories:",
+        "- reinforcement-learning",
+        "- robotics",
+        "tags:",
+        *(
+            f"- {tag}"
+            for tag in ("navrep", "robot-navigation", "lidar", "crowd", "orca", "world-models", "hdf5")
+        ),
+        "size_categories:",
+        f"- {_size_category(m.rows)}",
+        "configs:",
+        "- config_name: default",
+        "  data_files:",
+        "  - split: train",
+        '    path: "data/*.h5"',
+        "---",
+    ]
+    return "\n".join(lines)
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(str(v) for v in row) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def _number(value: Any) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def _columns_table(all_layouts: dict[str, Layout]) -> str:
+    rows = []
+    for name, layout in all_layouts.items():
+        unit = COLUMNS[name].unit
+        if name == "scan":
+            unit = "mm" if layout.dtype.kind == "u" else "m"
+        shape = f"({', '.join(map(str, layout.row_shape))}{',' if len(layout.row_shape) == 1 else ''})"
+        rows.append((f"`{name}`", f"{shape} {layout.dtype.name}", unit, COLUMNS[name].description))
+    return _table(("column", "per row", "unit", "meaning"), rows)
+
+
+def _statistics_table(statistics: dict[str, Any]) -> str:
+    rows = []
+    for name, values in statistics.get("columns", {}).items():
+        if name in ("sequence", "episode"):
+            continue
+        keys = ("mean", "std", "min", "max")
+        if name not in VECTOR_COLUMNS:
+            rows.append((f"`{name}`{' [m]' if name == 'scan' else ''}", *(_number(values[k]) for k in keys)))
+            continue
+        for k in range(len(values["mean"])):
+            rows.append((f"`{name}[{k}]`", *(_number(values[key][k]) for key in keys)))
+    return _table(("column", "mean", "std", "min", "max"), rows)
+
+
+def _outcomes_table(statistics: dict[str, Any]) -> str:
+    rows = [
+        (
+            name,
+            f"{v['episodes']:,}",
+            f"{100 * v['share']:.1f} %",
+            f"{v['mean_length']:.1f}",
+            v["min_length"],
+            v["max_length"],
+        )
+        for name, v in statistics.get("outcomes", {}).items()
+    ]
+    return _table(("event", "episodes", "share", "mean steps", "min", "max"), rows)
+
+
+def _limits(m: Manifest) -> str:
+    lines = ["* Simulated: flat ground, a planar lidar without noise, humans that follow ORCA."]
+    if m.scan_dtype == "uint16":
+        lines.append(
+            "* Scans are rounded to millimetres: about 1 frame in 8 has one rings cell one bin off that of "
+            "float32."
+        )
+    lines += [
+        "* Equal bytes for the same command are promised for one package version, locked dependencies and "
+        "CPU family; `navrep-data verify --regenerate` compares elsewhere.",
+        "* An episode of T actions has T + 1 rows; the action and reward of its last row mean nothing. "
+        "`cut` marks episodes that the end of a sequence cut off.",
+    ]
+    return "\n".join(lines)
+
+
+def dataset_card(manifest: Manifest) -> str:
+    """Return the dataset card: a function of the manifest alone, without dates.
+
+    Parameters
+    ----------
+    manifest : Manifest
+        With shards and statistics; its `card_sha256` is not used.
+
+    Returns
+    -------
+    str
+        Markdown with Hugging Face front matter.
+    """
+    m = manifest
+    all_layouts = layouts(m.columns, m.sensor, m.scan_dtype, m.max_humans, m.length)
+    humans = m.statistics.get("humans_per_episode") or {}
+    crowd = (
+        f" Humans per episode: {_number(humans['mean'])} on average "
+        f"({_number(humans['min'])} to {_number(humans['max'])})."
+        if humans.get("count")
+        else ""
+    )
+    splits = [(n, f"{sum(b - a for a, b in m.splits.get(n, ())):,}") for n in SPLITS]
+    command = m.command or "(not recorded)"
+    versions = ", ".join(f"{k} {v}" for k, v in m.versions.items())
+    return f"""{_front_matter(m)}
+
+# navrep-data: {m.env}
+
+{m.rows:,} steps of a robot among humans, in {m.sequences:,} sequences of {m.length:,} steps: lidar
+scans, robot states, actions, rewards and the crowd behind them.
+Environment `{m.env}`, `{m.physics}` physics, seed {m.seed}.
+{len(m.shards):,} HDF5 shards, {m.bytes:,} bytes ({m.bytes / max(m.rows, 1):,.0f} per step).
+
+Made by navrep-data, an independent re-implementation of the simulator of NavRep (Dugas et al. 2020);
+it is not made or endorsed by the NavRep authors. If you use it, please cite their paper:
+
+```bibtex
+{CITATION}
+```
+
+## How it was made
+
+```
+{command}
+```
+
+Versions: {versions or "(not recorded)"}. Policy: `{json.dumps(m.policy, ensure_ascii=False)}`.
+{m.sensor.n_rays} rays from {m.sensor.angle_min:g} rad, {m.sensor.angle_increment:.6g} rad apart,
+anticlockwise; up to {m.sensor.range_max:g} m; one step is {m.sensor.dt:g} s.
+
+## Columns
+
+{_columns_table(all_layouts)}
+
+`worlds/` holds the obstacles, goals and start states of each episode, one npz per shard.
+
+## Outcomes
+
+{_outcomes_table(m.statistics)}
+
+{sum(v["episodes"] for v in m.statistics.get("outcomes", {}).values()):,} episodes.{crowd}
+
+## Splits
+
+By sequence ({m.split_rule}); ranges are in `manifest.json`.
+The Hub's viewer shows all sequences as one split.
+
+{_table(("split", "sequences"), splits)}
+
+## Statistics
+
+Without NaN, padding, invalid rays, and the actions and rewards of last rows.
+
+{_statistics_table(m.statistics)}
+
+## How to load it
+
+```python
+from navrep_data.datasets import SequenceDataset
+
+windows = SequenceDataset("path/to/this/folder", lidar="rings", window=32, split="train")
+```
+
+Without navrep-data, any HDF5 reader works:
+
+```python
+import h5py
+
+with h5py.File("data/shard-00000.h5") as shard:
+    scans_in_metres = shard["scan"][:32] * shard["scan"].attrs["scale"]
+    actions = shard["action"][:32]
+```
+
+`navrep-data verify path/to/this/folder` checks every byte against the hashes in `manifest.json`.
+
+## Known limits
+
+{_limits(m)}
+"""

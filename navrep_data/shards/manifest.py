@@ -1,0 +1,409 @@
+"""The manifest: which shards a dataset has, with hashes, settings, splits and statistics.
+
+``manifest.json`` is the last thing written, so whatever it lists is in place. It may come from anywhere:
+reading checks every field and every file name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, SchemaVersionError
+from navrep_data.io import atomic_write_bytes, json_bytes, read_json
+from navrep_data.schema import FORMAT_NAME, FORMAT_VERSION, SensorContract
+from navrep_data.shards._fields import SHA256, Fields, is_range
+from navrep_data.shards._layout import SCAN_DTYPES, column_order
+from navrep_data.shards.entries import SPLIT_RULE, SPLITS, Ranges, ShardEntry, default_splits
+from navrep_data.shards.statistics import check_statistics, merge_statistics
+
+MANIFEST_FILE = "manifest.json"
+CARD_FILE = "README.md"
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Everything about a dataset but its rows.
+
+    Attributes
+    ----------
+    env, physics : str
+        Environment and physics that made it.
+    seed : int
+        Dataset seed.
+    length : int
+        Rows of a sequence (imports: of the longest).
+    planned : int
+        Sequences asked for.
+    shard_size : int
+        Sequences per shard.
+    scan_dtype : {"uint16", "float32"}
+        How scans are stored.
+    columns : tuple of str
+        Columns, in the schema's order.
+    max_humans : int
+        Slots of the humans column.
+    sensor : SensorContract
+        What a scan means.
+    config, policy, versions : dict
+        Whole configuration, the policy that drove, and versions of what computed it: JSON values.
+    shards : tuple of ShardEntry
+        In order of their sequences; gaps only while not complete.
+    splits : dict of str to ranges
+        Ranges [start, stop) of sequence indices by split.
+    split_rule : str
+        The rule behind `splits`, in words.
+    complete : bool
+        Whether all planned sequences are there.
+    statistics : dict
+        Merged over shards.
+    command : str
+        Command line that makes the same dataset, for the card.
+    card_sha256 : str or None
+        Hash of README.md; None while not complete.
+    format_version : int
+        Version of the format.
+    """
+
+    env: str
+    physics: str
+    seed: int
+    length: int
+    planned: int
+    shard_size: int
+    scan_dtype: str
+    columns: tuple[str, ...]
+    max_humans: int
+    sensor: SensorContract
+    config: dict[str, Any] = field(repr=False)
+    policy: dict[str, Any] = field(repr=False)
+    versions: dict[str, Any] = field(repr=False)
+    shards: tuple[ShardEntry, ...] = field(default=(), repr=False)
+    splits: dict[str, Ranges] = field(default_factory=dict, repr=False)
+    split_rule: str = SPLIT_RULE
+    complete: bool = False
+    statistics: dict[str, Any] = field(default_factory=dict, repr=False)
+    command: str = ""
+    card_sha256: str | None = None
+    format_version: int = FORMAT_VERSION
+
+    @property
+    def rows(self) -> int:
+        """Rows in the listed shards."""
+        return sum(shard.rows for shard in self.shards)
+
+    @property
+    def sequences(self) -> int:
+        """Sequences in the listed shards."""
+        return sum(shard.sequences[1] - shard.sequences[0] for shard in self.shards)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the listed shards and their worlds."""
+        return sum(s.bytes + (s.worlds.bytes if s.worlds else 0) for s in self.shards)
+
+    def with_shards(
+        self, shards: Iterable[ShardEntry], *, complete: bool, splits: Mapping[str, Ranges] | None = None
+    ) -> Manifest:
+        """Return a manifest that lists `shards`, with statistics merged in their order and splits to match.
+
+        Parameters
+        ----------
+        shards : iterable of ShardEntry
+            In any order.
+        complete : bool
+            Whether these are all planned sequences.
+        splits : mapping, optional
+            Other splits than the default rule's (set `split_rule` too).
+        """
+        ordered = tuple(sorted(shards, key=lambda shard: shard.sequences))
+        stop = ordered[-1].sequences[1] if ordered else 0
+        manifest = replace(
+            self,
+            shards=ordered,
+            complete=complete,
+            statistics=merge_statistics(shard.statistics for shard in ordered),
+            splits=dict(splits) if splits is not None else default_splits(stop),
+            card_sha256=None,
+        )
+        problem = _check_shards(manifest) or _check_splits(manifest)
+        if problem:
+            raise ConfigError(f"These shards are not a dataset: {problem}.")
+        return manifest
+
+    def split_of(self, sequence: int) -> str | None:
+        """Return the name of the split that holds `sequence`, or None."""
+        for name, ranges in self.splits.items():
+            if any(start <= sequence < stop for start, stop in ranges):
+                return name
+        return None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON values; the last one, ``manifest_sha256``, is the hash over all before it."""
+        values: dict[str, Any] = {
+            "format": FORMAT_NAME,
+            "format_version": self.format_version,
+            "env": self.env,
+            "physics": self.physics,
+            "seed": self.seed,
+            "length": self.length,
+            "sequences": self.sequences,
+            "rows": self.rows,
+            "complete": self.complete,
+            "planned": self.planned,
+            "shard_size": self.shard_size,
+            "scan_dtype": self.scan_dtype,
+            "columns": list(self.columns),
+            "max_humans": self.max_humans,
+            "sensor": self.sensor.to_dict(),
+            "config": self.config,
+            "policy": self.policy,
+            "versions": self.versions,
+            "command": self.command,
+            "statistics": self.statistics,
+            "split_rule": self.split_rule,
+            "splits": {name: [list(r) for r in ranges] for name, ranges in self.splits.items()},
+            "shards": [_entry_dict(shard) for shard in self.shards],
+            "card_sha256": self.card_sha256,
+        }
+        values["manifest_sha256"] = _hash(values)
+        return values
+
+    @classmethod
+    def read(cls, root: Path | str) -> Manifest:
+        """Read and check the manifest of a dataset.
+
+        Parameters
+        ----------
+        root : path-like
+            Dataset folder.
+
+        Raises
+        ------
+        DatasetNotFoundError
+            If there is no folder or no manifest in it.
+        SchemaVersionError
+            If it is of a newer format version.
+        CorruptDataError
+            If a field has another type or value than the format asks for, or names a file outside the folder.
+        """
+        root = Path(root)
+        path = root / MANIFEST_FILE
+        if not path.is_file():
+            seen = "has no manifest.json" if root.is_dir() else "is not a folder"
+            raise DatasetNotFoundError(
+                f"No dataset in {root}: it {seen}. "
+                f"Expected a folder written by `navrep-data generate --out {root}`."
+            )
+        try:
+            values = read_json(path)
+        except OSError as error:
+            raise CorruptDataError(
+                f"{path} cannot be read ({error.strerror}); check its permissions or get it again."
+            ) from error
+        return cls.from_dict(values, root)
+
+    @classmethod
+    def from_dict(cls, values: Any, root: Path) -> Manifest:
+        """Return the manifest given by parsed JSON; `root` serves for messages and to check file names.
+
+        Raises
+        ------
+        SchemaVersionError, CorruptDataError
+            As in :meth:`read`.
+        """
+        fields = Fields(values, root / MANIFEST_FILE)
+        if fields.get("format", str) != FORMAT_NAME:
+            fields.bad("format", f"{FORMAT_NAME!r}")
+        version = fields.count("format_version")
+        if version > FORMAT_VERSION or version < 1:
+            raise SchemaVersionError(
+                f"{root} has format version {version}; this package reads versions 1 to {FORMAT_VERSION}. "
+                "Upgrade it: pip install -U navrep-data"
+            )
+        try:
+            manifest = _parse(fields, root)
+        except RecursionError:
+            raise CorruptDataError(f"{root / MANIFEST_FILE} is nested too deeply; get it again.") from None
+        problem = _check_shards(manifest) or _check_splits(manifest)
+        if not problem and (manifest.rows, manifest.sequences) != (
+            fields.count("rows"),
+            fields.count("sequences"),
+        ):
+            problem = "fields 'rows' and 'sequences' are not the sums over shards"
+        if not problem and values.get("manifest_sha256") != _hash(values):
+            problem = "field 'manifest_sha256' does not match the other fields"
+        if problem:
+            raise CorruptDataError(
+                f"{root / MANIFEST_FILE}: {problem}. The file was changed or damaged; get it again, "
+                "or run the generate command again."
+            )
+        return manifest
+
+    def save(self, root: Path | str, card: str | None = None) -> Manifest:
+        """Write ``manifest.json`` (and before it ``README.md``, if given), each atomically.
+
+        Parameters
+        ----------
+        root : path-like
+            Dataset folder.
+        card : str, optional
+            Dataset card, of a complete dataset: see :func:`navrep_data.shards.dataset_card`.
+
+        Returns
+        -------
+        Manifest
+            As written, with the card's hash.
+        """
+        root = Path(root)
+        manifest = replace(self, card_sha256=None)
+        if card is not None:
+            data = card.encode()
+            manifest = replace(self, card_sha256=hashlib.sha256(data).hexdigest())
+            atomic_write_bytes(root / CARD_FILE, data)
+        atomic_write_bytes(root / MANIFEST_FILE, json_bytes(manifest.to_dict()))
+        return manifest
+
+
+def _hash(values: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json_bytes({k: v for k, v in values.items() if k != "manifest_sha256"})).hexdigest()
+
+
+def _entry_dict(shard: ShardEntry) -> dict[str, Any]:
+    values = asdict(shard)
+    values["sequences"] = list(shard.sequences)
+    values["sequence_hashes"] = list(shard.sequence_hashes)
+    return values
+
+
+def _parse(fields: Fields, root: Path) -> Manifest:
+    """Return the manifest behind checked fields; consistency between them is checked elsewhere."""
+    scan_dtype = fields.get("scan_dtype", str)
+    if scan_dtype not in SCAN_DTYPES:
+        fields.bad("scan_dtype", " or ".join(SCAN_DTYPES))
+    columns = fields.strings("columns")
+    try:
+        if column_order(columns) != columns:
+            fields.bad("columns", "the columns in the schema's order")
+    except ConfigError as error:
+        raise CorruptDataError(f"{fields.path}: field 'columns': {error}") from None
+    length, max_humans = fields.count("length"), fields.count("max_humans")
+    if not 1 <= length < 1 << 31:
+        fields.bad("length", "at least 1")
+    if max_humans >= 1 << 16 or (max_humans < 1 and "humans" in columns):
+        fields.bad("max_humans", "1 to 65535")
+    card = fields.values.get("card_sha256")
+    return Manifest(
+        env=fields.get("env", str),
+        physics=fields.get("physics", str),
+        seed=fields.count("seed"),
+        length=length,
+        planned=fields.count("planned"),
+        shard_size=fields.count("shard_size"),
+        scan_dtype=scan_dtype,
+        columns=columns,
+        max_humans=max_humans,
+        sensor=_parse_sensor(fields),
+        config=fields.get("config", dict),
+        policy=fields.get("policy", dict),
+        versions=fields.get("versions", dict),
+        shards=tuple(_parse_shard(fields, k, root, columns) for k in range(len(fields.get("shards", list)))),
+        splits=_parse_splits(fields),
+        split_rule=fields.get("split_rule", str),
+        complete=fields.get("complete", bool),
+        statistics=_parse_statistics(fields, columns),
+        command=fields.get("command", str),
+        card_sha256=None if card is None else fields.sha256("card_sha256"),
+        format_version=fields.count("format_version"),
+    )
+
+
+def _parse_sensor(fields: Fields) -> SensorContract:
+    values = fields.get("sensor", dict)
+    names = SensorContract().to_dict()
+    if set(values) != set(names) or any(
+        isinstance(v, bool) or not isinstance(v, int | float) for v in values.values()
+    ):
+        fields.bad("sensor", f"numbers named {', '.join(names)}")
+    if (
+        not isinstance(values["n_rays"], int)
+        or not 1 <= values["n_rays"] <= 1 << 20
+        or values["range_max"] <= 0
+    ):
+        fields.bad("sensor", "n_rays of 1 or more and range_max above 0")
+    return SensorContract(**values)
+
+
+def _parse_statistics(fields: Fields, columns: Sequence[str]) -> dict[str, Any]:
+    values: dict[str, Any] = fields.get("statistics", dict)
+    problem = check_statistics(values, columns) if values else ""
+    if problem:
+        raise CorruptDataError(
+            f"{fields.path}: field '{fields.prefix}statistics' {problem}; get the file again."
+        )
+    return values
+
+
+def _parse_splits(fields: Fields) -> dict[str, Ranges]:
+    values = fields.get("splits", dict)
+    for ranges in values.values():
+        if not isinstance(ranges, list) or not all(is_range(r) for r in ranges):
+            fields.bad("splits", "lists of [start, stop] by split")
+    return {str(name): tuple((r[0], r[1]) for r in ranges) for name, ranges in values.items()}
+
+
+def _parse_shard(parent: Fields, index: int, root: Path, columns: Sequence[str]) -> ShardEntry:
+    prefix = f"shards[{index}]."
+    fields = Fields(parent.values["shards"][index], parent.path, prefix)
+    file = fields.file(root)
+    worlds = fields.values.get("worlds")
+    first, stop = fields.pair("sequences")
+    hashes = fields.strings("sequence_hashes")
+    if len(hashes) != stop - first or not all(SHA256.fullmatch(h) for h in hashes):
+        fields.bad("sequence_hashes", f"{stop - first} hashes of 64 hex digits")
+    return ShardEntry(
+        file=file.file,
+        sha256=file.sha256,
+        bytes=file.bytes,
+        rows=fields.count("rows"),
+        sequences=(first, stop),
+        worlds=None if worlds is None else Fields(worlds, parent.path, prefix + "worlds.").file(root),
+        statistics=_parse_statistics(fields, columns),
+        sequence_hashes=hashes,
+    )
+
+
+def _check_shards(manifest: Manifest) -> str:
+    """Return what is wrong with the list of shards, or an empty string."""
+    stop = 0
+    for shard in manifest.shards:
+        if shard.sequences[0] < stop:
+            return f"{shard.file} starts at sequence {shard.sequences[0]}, which another shard holds"
+        if manifest.complete and shard.sequences[0] != stop:
+            return f"sequences {stop} to {shard.sequences[0] - 1} are missing in a complete dataset"
+        count = shard.sequences[1] - shard.sequences[0]
+        if not count <= shard.rows <= count * manifest.length:
+            return f"{shard.file} has {shard.rows} rows for {count} sequences of at most {manifest.length}"
+        stop = shard.sequences[1]
+    files = [s.file for s in manifest.shards] + [s.worlds.file for s in manifest.shards if s.worlds]
+    if len(set(files)) != len(files):
+        return "a file is listed twice"
+    if manifest.complete and stop != manifest.planned:
+        return f"it is marked complete with {stop} of {manifest.planned} sequences"
+    return ""
+
+
+def _check_splits(manifest: Manifest) -> str:
+    ranges = sorted(r for part in manifest.splits.values() for r in part)
+    if any(a[1] > b[0] for a, b in itertools.pairwise(ranges)):
+        return "a sequence is in two splits"
+    if not set(manifest.splits) <= set(SPLITS):
+        return f"splits are named {sorted(manifest.splits)}, expected {', '.join(SPLITS)}"
+    stop = manifest.shards[-1].sequences[1] if manifest.shards else 0
+    if ranges and ranges[-1][1] > stop:
+        return f"a split holds sequence {ranges[-1][1] - 1}, but the last one is {stop - 1}"
+    return ""

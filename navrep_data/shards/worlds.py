@@ -1,0 +1,308 @@
+"""Worlds files: what stands around the robot in each episode, as a small npz beside each shard.
+
+With them scenes can be drawn and other sensors recomputed. Ragged data are flat arrays with offsets. The zip
+container is written here, not by the zipfile module: no timestamps, and isal's deflate, so that equal content
+is equal bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from isal import isal_zlib
+
+from navrep_data.errors import CorruptDataError
+
+MAX_WORLDS_BYTES = 256 << 20
+_ADVICE = "get the file again, or run the generate command again"
+# Name -> (dtype, shape after the first axis, what the first axis counts).
+_FIELDS: dict[str, tuple[str, tuple[int, ...], str]] = {
+    "sequence": ("<i4", (), "episode"),
+    "episode": ("<i4", (), "episode"),
+    "row": ("<i4", (), "episode"),
+    "robot_start": ("<f4", (3,), "episode"),
+    "robot_goal": ("<f4", (2,), "episode"),
+    "robot_v_pref": ("<f4", (), "episode"),
+    "vertices": ("<f4", (2,), "vertex"),
+    "polygon_offset": ("<i8", (), "polygon+1"),
+    "episode_polygon_offset": ("<i8", (), "episode+1"),
+    "has_border": ("|b1", (), "episode"),
+    "human_offset": ("<i8", (), "episode+1"),
+    "human_start": ("<f4", (3,), "human"),
+    "human_goal": ("<f4", (2,), "human"),
+    "human_v_pref": ("<f4", (), "human"),
+    "human_sees_robot": ("|b1", (), "human"),
+    "human_gait": ("<f4", (3,), "human"),
+}
+WORLD_FIELDS = tuple(_FIELDS)
+"""Names of the arrays of a worlds file, in file order."""
+
+Arrays = dict[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class EpisodeWorld:
+    """What stands around the robot in one episode.
+
+    Attributes
+    ----------
+    sequence, episode, row : int
+        Indices as in the columns; `row` is the episode's first row in its shard.
+    robot_start : ndarray of shape (3,), float32
+        x, y [m], heading [rad], world frame.
+    robot_goal : ndarray of shape (2,), float32
+        x, y [m], world frame.
+    robot_v_pref : float
+        Preferred speed [m/s].
+    polygons : tuple of ndarray of shape (V, 2), float32
+        Obstacles [m], world frame, anticlockwise.
+    border : ndarray of shape (V, 2), float32, or None
+        Polygon around everything, clockwise.
+    human_start : ndarray of shape (H, 3), float32
+        x, y [m], heading [rad] at the episode's first row.
+    human_goal : ndarray of shape (H, 2), float32
+        x, y [m].
+    human_v_pref : ndarray of shape (H,), float32
+        Preferred speeds [m/s].
+    human_sees_robot : ndarray of shape (H,), bool
+        Whether the human avoids the robot.
+    human_gait : ndarray of shape (H, 3), float32
+        Gait distances accumulated at the episode's first row [m, m, rad].
+    """
+
+    sequence: int
+    episode: int
+    row: int
+    robot_start: npt.NDArray[np.float32]
+    robot_goal: npt.NDArray[np.float32]
+    robot_v_pref: float
+    polygons: tuple[npt.NDArray[np.float32], ...]
+    border: npt.NDArray[np.float32] | None
+    human_start: npt.NDArray[np.float32]
+    human_goal: npt.NDArray[np.float32]
+    human_v_pref: npt.NDArray[np.float32]
+    human_sees_robot: npt.NDArray[np.bool_]
+    human_gait: npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Worlds:
+    """The worlds of the episodes of one shard.
+
+    Attributes
+    ----------
+    arrays : dict of str to ndarray
+        The file's arrays by name; see :data:`WORLD_FIELDS`.
+    """
+
+    arrays: Arrays
+
+    def __len__(self) -> int:
+        return len(self.arrays["episode"])
+
+    def episode(self, index: int) -> EpisodeWorld:
+        """Return episode `index` of the file.
+
+        Raises
+        ------
+        IndexError
+            If there is no such episode.
+        """
+        a = self.arrays
+        if not 0 <= index < len(self):
+            raise IndexError(f"Episode {index} is not in this worlds file; expected 0 to {len(self) - 1}.")
+        first, stop = (int(v) for v in a["episode_polygon_offset"][index : index + 2])
+        offsets = a["polygon_offset"]
+        polygons = [a["vertices"][offsets[p] : offsets[p + 1]] for p in range(first, stop)]
+        border = polygons.pop() if a["has_border"][index] else None
+        h = slice(*a["human_offset"][index : index + 2])
+        return EpisodeWorld(
+            sequence=int(a["sequence"][index]),
+            episode=int(a["episode"][index]),
+            row=int(a["row"][index]),
+            robot_start=a["robot_start"][index],
+            robot_goal=a["robot_goal"][index],
+            robot_v_pref=float(a["robot_v_pref"][index]),
+            polygons=tuple(polygons),
+            border=border,
+            human_start=a["human_start"][h],
+            human_goal=a["human_goal"][h],
+            human_v_pref=a["human_v_pref"][h],
+            human_sees_robot=a["human_sees_robot"][h],
+            human_gait=a["human_gait"][h],
+        )
+
+
+def check_worlds(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
+    """Return what is wrong with the arrays of a worlds file, or an empty string.
+
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+        As in :data:`WORLD_FIELDS`.
+    """
+    if set(arrays) != set(_FIELDS):
+        odd = sorted(set(arrays) ^ set(_FIELDS))[0]
+        return f"array {odd!r} is {'unexpected' if odd in arrays else 'missing'}"
+    for name, (dtype, tail, _) in _FIELDS.items():
+        array = arrays[name]
+        if array.dtype != np.dtype(dtype) or array.ndim != 1 + len(tail) or array.shape[1:] != tail:
+            wanted = f"{np.dtype(dtype)} ({', '.join(['n', *map(str, tail)])})"
+            return f"array {name!r} is {array.dtype} {array.shape}, expected {wanted}"
+    sizes = {
+        "episode": len(arrays["episode"]),
+        "human": len(arrays["human_start"]),
+        "vertex": len(arrays["vertices"]),
+    }
+    sizes["episode+1"] = sizes["episode"] + 1
+    sizes["polygon+1"] = len(arrays["polygon_offset"])
+    for name, (_, _, axis) in _FIELDS.items():
+        if len(arrays[name]) != sizes[axis]:
+            return f"array {name!r} has {len(arrays[name])} entries, expected {sizes[axis]}"
+    ends = {"polygon_offset": "vertex", "human_offset": "human", "episode_polygon_offset": "polygon+1"}
+    for name, axis in ends.items():
+        offset = arrays[name]
+        end = sizes[axis] - (axis == "polygon+1")
+        if not len(offset) or offset[0] != 0 or offset[-1] != end or (np.diff(offset) < 0).any():
+            return f"offsets {name!r} do not go up from 0 to {end}"
+    if (np.diff(arrays["episode_polygon_offset"]) < arrays["has_border"]).any():
+        return "an episode has a border but no polygon"
+    return ""
+
+
+def as_worlds(arrays: Mapping[str, npt.ArrayLike]) -> Arrays:
+    """Return the arrays of one sequence in the stored dtypes, checked.
+
+    Raises
+    ------
+    CorruptDataError
+        If an array is missing or has another shape.
+    """
+    cast = {k: np.asarray(v, dtype=_FIELDS[k][0] if k in _FIELDS else None) for k, v in arrays.items()}
+    problem = check_worlds(cast)
+    if problem:
+        raise CorruptDataError(f"Worlds of a sequence: {problem}; fix the caller of ShardWriter.append.")
+    return cast
+
+
+def concatenate_worlds(parts: Sequence[Arrays]) -> Arrays:
+    """Join the worlds of consecutive sequences; offsets, each starting at 0, are moved up."""
+    result: Arrays = {}
+    for name, (dtype, tail, axis) in _FIELDS.items():
+        if axis.endswith("+1"):
+            pieces, base = [np.zeros(1, dtype)], 0
+            for part in parts:
+                pieces.append(part[name][1:] + base)
+                base += int(part[name][-1])
+            result[name] = np.concatenate(pieces).astype(dtype)
+        else:
+            result[name] = np.concatenate([np.empty((0, *tail), dtype), *(part[name] for part in parts)])
+    return result
+
+
+def _zip_bytes(members: Mapping[str, bytes]) -> bytes:
+    """Return a zip archive of `members`, deflated, with the zip epoch as date."""
+    body, directory = [], []
+    offset = 0
+    for name, data in members.items():
+        packed = isal_zlib.compress(data, 2, -15)
+        # version 2.0, no flags, deflate, time 00:00, date 1980-01-01
+        common = struct.pack(
+            "<HHHHHIIIHH", 20, 0, 8, 0, 0x21, isal_zlib.crc32(data), len(packed), len(data), len(name), 0
+        )
+        head = b"PK\x03\x04" + common + name.encode("ascii")
+        directory.append(
+            b"PK\x01\x02\x14\x00" + common + struct.pack("<HHHII", 0, 0, 0, 0, offset) + name.encode("ascii")
+        )
+        body += [head, packed]
+        offset += len(head) + len(packed)
+    index = b"".join(directory)
+    end = b"PK\x05\x06" + struct.pack("<HHHHIIH", 0, 0, len(members), len(members), len(index), offset, 0)
+    return b"".join(body) + index + end
+
+
+def worlds_bytes(arrays: Arrays) -> bytes:
+    """Return a worlds file: equal arrays give equal bytes."""
+    members = {}
+    for name in _FIELDS:
+        buffer = io.BytesIO()
+        np.lib.format.write_array(
+            buffer, np.ascontiguousarray(arrays[name]), version=(1, 0), allow_pickle=False
+        )
+        members[f"{name}.npy"] = buffer.getvalue()
+    return _zip_bytes(members)
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
+    """Read one array without trusting its header."""
+    stream = io.BytesIO(archive.read(f"{name}.npy"))
+    if np.lib.format.read_magic(stream) != (1, 0):
+        raise ValueError(f"array {name!r} is not npy version 1.0")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    if dtype != np.dtype(_FIELDS[name][0]) or (fortran and len(shape) > 1):
+        raise ValueError(f"array {name!r} is {dtype}, expected {_FIELDS[name][0]} in C order")
+    data = stream.read()
+    count = 1
+    for n in shape:
+        count *= int(n)
+    if count < 0 or count * dtype.itemsize != len(data):
+        raise ValueError(f"array {name!r} has {len(data)} bytes, expected shape {shape}")
+    return np.frombuffer(data, dtype).reshape(shape)
+
+
+def parse_worlds(data: bytes, where: str) -> Worlds:
+    """Read the bytes of a worlds file; `where` names it in errors.
+
+    Raises
+    ------
+    CorruptDataError
+        If they are not a worlds file, or unpack to more than 256 MiB.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            names = [entry.filename for entry in archive.infolist()]
+            if sorted(names) != sorted(f"{name}.npy" for name in _FIELDS):
+                raise ValueError(f"its members are {names[:20]}")
+            # zipfile stops at the size that the directory declares, so this bounds what is unpacked.
+            if sum(entry.file_size for entry in archive.infolist()) > MAX_WORLDS_BYTES:
+                raise ValueError(f"it unpacks to more than {MAX_WORLDS_BYTES:,} bytes")
+            arrays = {name: _member(archive, name) for name in _FIELDS}
+        problem = check_worlds(arrays)
+        if problem:
+            raise ValueError(problem)
+    except (
+        Exception
+    ) as error:  # damaged zips raise a dozen kinds, NotImplementedError and struct.error among them
+        reason = str(error).rstrip(".") or type(error).__name__
+        raise CorruptDataError(f"{where} is not a worlds file: {reason}; {_ADVICE}.") from error
+    return Worlds(arrays)
+
+
+def read_worlds(path: Path | str) -> Worlds:
+    """Read a worlds file.
+
+    Parameters
+    ----------
+    path : path-like
+        ``worlds/shard-NNNNN.npz`` of a dataset.
+
+    Raises
+    ------
+    CorruptDataError
+        If it is no worlds file, or larger than 256 MiB.
+    """
+    path = Path(path)
+    size = path.stat().st_size
+    if size > MAX_WORLDS_BYTES:
+        raise CorruptDataError(
+            f"{path} has {size:,} bytes, expected at most {MAX_WORLDS_BYTES:,}; {_ADVICE}."
+        )
+    return parse_worlds(path.read_bytes(), str(path))

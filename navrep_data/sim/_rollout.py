@@ -1,0 +1,273 @@
+"""Rows: whole sequences under a scripted policy, and batches of worlds stepped for anybody else.
+
+One row = one observation and the action taken from it. Both ways of making rows call the same functions in the same
+order, so a sequence has the same bytes however it was made.
+"""
+
+import numpy as np
+from numba import njit
+
+from navrep_data.sim._judge import CUT, NONE, STUCK
+from navrep_data.sim._layout import (
+    A_GAIT_T,
+    A_GAIT_X,
+    A_GAIT_Y,
+    A_GX,
+    A_GY,
+    A_HEADING,
+    A_RADIUS,
+    A_SEES,
+    A_VPREF,
+    A_X,
+    A_Y,
+    F_POLICY,
+    F_SCAN_MM,
+    F_WANT_HUMANS,
+    P_OMEGA_NOISE,
+    P_POLICY_SPEED,
+    P_RANGE_MAX,
+    P_STUCK_SPEED,
+    POLICY_CONSTANT_VELOCITY,
+    POLICY_GOAL_MOMENTUM,
+    POLICY_ORCA,
+    S_BORDER,
+    S_EPISODE,
+    S_HUMANS,
+    S_OBST_ROBOT,
+    S_POLYGONS,
+    S_STEP,
+)
+from navrep_data.sim._rng import uniform
+from navrep_data.sim._step import observe_humans, observe_scan, observe_state, orca_choice, pack_orca, reset_world, step_world
+
+# make_vae_dataset.py, RandomMomentumPolicy: speed <- clip(speed + 0.1 (u - 0.5) - speed (0.01, 0.01, 0.1), +-0.5)
+MOMENTUM_NOISE = 0.1
+MOMENTUM_DRAG = 0.01
+MOMENTUM_SPIN_DRAG = 0.1
+MOMENTUM_LIMIT = 0.5
+# ours: how strongly goal-seeking momentum is pulled towards full speed at the goal, per step
+GOAL_PULL = 0.05
+
+
+@njit(cache=True, error_model="numpy")
+def choose_action(agents, agents32, scalars, obst_f, obst_i, rng, params, flags, orca_params, work_f, work_i, memory, out):
+    """Fill out (3,) with a scripted policy's body command; returns False where it gives up (ORCA's stuck rule).
+
+    `memory` (3,) is the policy's own state, zero at the start of each episode.
+    """
+    policy = flags[F_POLICY]
+    heading = agents[0, A_HEADING]
+    c, s = np.cos(heading), np.sin(heading)
+    if policy == POLICY_ORCA:
+        n = int(scalars[S_HUMANS])
+        pack_orca(agents, n + 1, agents32)
+        vx, vy = orca_choice(
+            0, agents, agents32, n, obst_f[-1], obst_i[-1], int(scalars[S_OBST_ROBOT]), orca_params, work_f, work_i
+        )
+        wx, wy = np.float64(vx), np.float64(vy)
+        if np.hypot(wx, wy) < params[P_STUCK_SPEED]:
+            out[:] = 0.0
+            return False
+        out[0] = c * wx + s * wy
+        out[1] = c * wy - s * wx
+        out[2] = params[P_OMEGA_NOISE] * (uniform(rng) - 0.5)
+        return True
+    if policy == POLICY_CONSTANT_VELOCITY:
+        if scalars[S_STEP] == 0.0:
+            speed = params[P_POLICY_SPEED] * uniform(rng)
+            direction = 2.0 * np.pi * uniform(rng)
+            memory[0] = speed * np.cos(direction)
+            memory[1] = speed * np.sin(direction)
+    else:
+        if scalars[S_STEP] == 0.0:
+            memory[:] = 0.0
+        for k in range(3):
+            drag = MOMENTUM_SPIN_DRAG if k == 2 else MOMENTUM_DRAG
+            value = memory[k] + MOMENTUM_NOISE * (uniform(rng) - 0.5) - drag * memory[k]
+            memory[k] = min(max(value, -MOMENTUM_LIMIT), MOMENTUM_LIMIT)
+        if policy == POLICY_GOAL_MOMENTUM:
+            gx = agents[0, A_GX] - agents[0, A_X]
+            gy = agents[0, A_GY] - agents[0, A_Y]
+            norm = max(np.hypot(gx, gy), 1e-6)
+            pull_x = params[P_POLICY_SPEED] * (c * gx + s * gy) / norm
+            pull_y = params[P_POLICY_SPEED] * (c * gy - s * gx) / norm
+            memory[0] += GOAL_PULL * (pull_x - memory[0])
+            memory[1] += GOAL_PULL * (pull_y - memory[1])
+    out[0], out[1], out[2] = memory[0], memory[1], memory[2]
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def store_scan(scan, range_max, out_mm):
+    """Write a float32 scan [m] as millimetres: rounded half to even, at least 1."""
+    for k in range(scan.shape[0]):
+        value = np.rint(np.float64(min(scan[k], np.float32(range_max))) * 1000.0)
+        out_mm[k] = np.uint16(max(value, 1.0))
+
+
+@njit(cache=True, error_model="numpy")
+def note_episode(row, agents, scalars, vertices, polygon_start, episodes, corners, sizes, humans, counts):
+    """Append the present episode's static side to the worlds tables; `counts` (4,) holds how full each of them is.
+
+    episodes (E, 10): row, robot x, y, heading, goal x, y, v_pref, has border, number of polygons, number of humans.
+    sizes (P,): corners of each polygon; corners (V, 2). humans (Hn, 10): x, y, heading, goal x, y, v_pref, sees the
+    robot, gait x, y, theta.
+    """
+    e, v, p, h = counts[0], counts[1], counts[2], counts[3]
+    n_polygons, n_humans = int(scalars[S_POLYGONS]), int(scalars[S_HUMANS])
+    episodes[e, 0] = row
+    episodes[e, 1], episodes[e, 2], episodes[e, 3] = agents[0, A_X], agents[0, A_Y], agents[0, A_HEADING]
+    episodes[e, 4], episodes[e, 5] = agents[0, A_GX], agents[0, A_GY]
+    episodes[e, 6], episodes[e, 7] = agents[0, A_VPREF], scalars[S_BORDER]
+    episodes[e, 8], episodes[e, 9] = n_polygons, n_humans
+    for k in range(n_polygons):
+        sizes[p + k] = polygon_start[k + 1] - polygon_start[k]
+    for m in range(polygon_start[n_polygons]):
+        corners[v + m, 0] = vertices[m, 0]
+        corners[v + m, 1] = vertices[m, 1]
+    for i in range(1, n_humans + 1):
+        t = h + i - 1
+        humans[t, 0], humans[t, 1], humans[t, 2] = agents[i, A_X], agents[i, A_Y], agents[i, A_HEADING]
+        humans[t, 3], humans[t, 4] = agents[i, A_GX], agents[i, A_GY]
+        humans[t, 5], humans[t, 6] = agents[i, A_VPREF], agents[i, A_SEES]
+        humans[t, 7], humans[t, 8], humans[t, 9] = agents[i, A_GAIT_X], agents[i, A_GAIT_Y], agents[i, A_GAIT_T]
+    counts[0] = e + 1
+    counts[1] = v + polygon_start[n_polygons]
+    counts[2] = p + n_polygons
+    counts[3] = h + n_humans
+
+
+@njit(cache=True, error_model="numpy")
+def begin_row(
+    row, agents, scalars, vertices, polygon_start, edges, circles, dirs, inv_work, owner_work, hits, scan32,
+    params, flags, out_scan, out_floats, out_ints, out_humans, episodes, corners, sizes, humans, counts,
+):  # fmt: skip
+    """Observe a world and write this row's observation; on an episode's first row also its static side."""
+    if scalars[S_STEP] == 0.0:
+        note_episode(row, agents, scalars, vertices, polygon_start, episodes, corners, sizes, humans, counts)
+    observe_scan(
+        agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, scan32
+    )
+    if flags[F_SCAN_MM]:
+        store_scan(scan32, params[P_RANGE_MAX], out_scan[row])
+    else:
+        for k in range(scan32.shape[0]):
+            out_scan[row, k] = scan32[k]
+    floats = out_floats[row]
+    observe_state(agents, scalars, floats[:5])
+    for k in range(5, 9):
+        floats[k] = 0.0
+    floats[9] = agents[0, A_X]
+    floats[10] = agents[0, A_Y]
+    floats[11] = agents[0, A_HEADING]
+    floats[12] = agents[0, A_RADIUS]
+    out_ints[row, 0] = NONE
+    out_ints[row, 1] = int(scalars[S_EPISODE])
+    out_ints[row, 2] = int(scalars[S_STEP])
+    if flags[F_WANT_HUMANS]:
+        observe_humans(agents, int(scalars[S_HUMANS]), hits, out_humans[row])
+
+
+@njit(cache=True, error_model="numpy")
+def finish_row(
+    row, length, pending, gave_up, action, agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i,
+    boxes, rng, params, flags, orca_params, work_f, work_i, moves, result, out_floats, out_ints,
+):  # fmt: skip
+    """Take the row's action, or end its episode; returns the event that ends the episode at the next row.
+
+    `pending` is that event from the row before. -1 is returned where no new world could be made.
+    """
+    last = row == length - 1
+    if pending != NONE:
+        out_ints[row, 0] = pending
+    elif last:
+        out_ints[row, 0] = CUT
+    elif gave_up:
+        out_ints[row, 0] = STUCK
+    else:
+        # what is stored is what was executed
+        ax, ay, omega = np.float32(action[0]), np.float32(action[1]), np.float32(action[2])
+        step_world(
+            agents, agents32, scalars, edges, polygon_start, obst_f, obst_i, params, orca_params, work_f, work_i,
+            moves, np.float64(ax), np.float64(ay), np.float64(omega), result,
+        )  # fmt: skip
+        out_floats[row, 5], out_floats[row, 6], out_floats[row, 7] = ax, ay, omega
+        out_floats[row, 8] = result[0]
+        return int(result[1])
+    if not last and not reset_world(
+        agents, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags
+    ):
+        return -1
+    return NONE
+
+
+@njit(cache=True, error_model="numpy")
+def rollout_sequence(
+    agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, circles, dirs,
+    inv_work, owner_work, hits, scan32, work_f, work_i, moves, params, flags, orca_params,
+    out_scan, out_floats, out_ints, out_humans, episodes, corners, sizes, humans, counts,
+):  # fmt: skip
+    """Simulate one sequence under a scripted policy into the out arrays; returns False if no world could be made.
+
+    The random stream `rng` must be seeded; everything else is set here.
+    """
+    length = out_floats.shape[0]
+    memory = np.zeros(3)
+    action = np.zeros(3)
+    result = np.zeros(2)
+    counts[:] = 0
+    scalars[:] = 0.0
+    scalars[S_EPISODE] = -1.0
+    if not reset_world(agents, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags):
+        return False
+    pending = NONE
+    for row in range(length):
+        begin_row(
+            row, agents, scalars, vertices, polygon_start, edges, circles, dirs, inv_work, owner_work, hits, scan32,
+            params, flags, out_scan, out_floats, out_ints, out_humans, episodes, corners, sizes, humans, counts,
+        )  # fmt: skip
+        gave_up = False
+        if pending == NONE and row < length - 1:
+            gave_up = not choose_action(
+                agents, agents32, scalars, obst_f, obst_i, rng, params, flags, orca_params, work_f, work_i,
+                memory, action,
+            )  # fmt: skip
+        pending = finish_row(
+            row, length, pending, gave_up, action, agents, agents32, scalars, vertices, polygon_start, edges,
+            obst_f, obst_i, boxes, rng, params, flags, orca_params, work_f, work_i, moves, result,
+            out_floats, out_ints,
+        )  # fmt: skip
+        if pending < 0:
+            return False
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def begin_rows(
+    row, agents, scalars, vertices, polygon_start, edges, circles, dirs, inv_work, owner_work, hits, scan32,
+    params, flags, out_scan, out_floats, out_ints, out_humans, episodes, corners, sizes, humans, counts,
+):  # fmt: skip
+    """Call :func:`begin_row` on every world of a batch (arrays with a leading world axis)."""
+    for w in range(agents.shape[0]):
+        begin_row(
+            row, agents[w], scalars[w], vertices[w], polygon_start[w], edges[w], circles, dirs, inv_work, owner_work,
+            hits[w], scan32[w], params, flags, out_scan[w], out_floats[w], out_ints[w], out_humans[w],
+            episodes[w], corners[w], sizes[w], humans[w], counts[w],
+        )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def finish_rows(
+    row, length, pending, gave_up, actions, agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i,
+    boxes, rng, params, flags, orca_params, work_f, work_i, moves, result, out_floats, out_ints,
+):  # fmt: skip
+    """Call :func:`finish_row` on every world of a batch; returns False if one could not be made anew."""
+    for w in range(agents.shape[0]):
+        pending[w] = finish_row(
+            row, length, pending[w], gave_up[w], actions[w], agents[w], agents32, scalars[w], vertices[w],
+            polygon_start[w], edges[w], obst_f[w], obst_i[w], boxes, rng[w], params, flags, orca_params,
+            work_f, work_i, moves, result, out_floats[w], out_ints[w],
+        )  # fmt: skip
+        if pending[w] < 0:
+            return False
+    return True

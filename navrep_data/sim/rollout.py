@@ -1,0 +1,269 @@
+"""Sequences: a fixed number of consecutive rows, holding several episodes, as columns ready to be stored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from navrep_data.errors import PolicyError, SimulationError
+from navrep_data.observations import scan_to_rings
+from navrep_data.schema import ACTION_SIZE, HUMAN_FIELDS, Event
+from navrep_data.sim import _layout as lay
+from navrep_data.sim._batch import reset_worlds, seed_worlds
+from navrep_data.sim._rollout import begin_rows, finish_rows, rollout_sequence
+from navrep_data.sim.config import SimConfig
+from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
+from navrep_data.sim.simulator import WorldArrays, check_seed
+
+PolicyFunction = Callable[[NDArray[np.float32], NDArray[np.float32]], Any]
+"""``policy(scan (B, rays) [m], robot_state (B, 5)) -> action (B, 2) or (B, 3)``, body velocities."""
+
+# columns of the packed float output of the kernels
+_STATE, _ACTION, _REWARD, _POSE, _RADIUS = slice(0, 5), slice(5, 8), 8, slice(9, 12), 12
+_FLOATS, _INTS = 13, 3
+_TERMINAL = np.array([event.terminal for event in Event])
+
+
+@dataclass(frozen=True)
+class RolloutSettings:
+    """How sequences are rolled out and stored.
+
+    Attributes
+    ----------
+    length : int
+        Rows per sequence.
+    scan_dtype : str
+        ``"uint16"`` millimetres or ``"float32"`` metres.
+    rings, humans : bool
+        Whether to fill these columns.
+    """
+
+    length: int = 1000
+    scan_dtype: str = "uint16"
+    rings: bool = True
+    humans: bool = True
+
+
+class _Outputs:
+    """Room for the rows of a batch of sequences; reused from batch to batch."""
+
+    def __init__(self, config: SimConfig, settings: RolloutSettings, n: int) -> None:
+        length, crowd = settings.length, config.max_humans
+        # every row may start an episode (a policy can give up at once), so tables grow only up to this
+        starts = length
+        self.scan = np.zeros((n, length, config.sensor.n_rays), settings.scan_dtype)
+        self.floats = np.zeros((n, length, _FLOATS), np.float32)
+        self.ints = np.zeros((n, length, _INTS), np.int32)
+        self.humans = np.zeros((n, length if settings.humans else 1, crowd, len(HUMAN_FIELDS)), np.float32)
+        self.episodes = np.zeros((n, starts, 10))
+        self.corners = np.zeros((n, starts * 4 * config.max_polygons, 2), np.float32)
+        self.sizes = np.zeros((n, starts * config.max_polygons), np.int32)
+        self.table = np.zeros((n, starts * max(1, crowd), 10), np.float32)
+        self.counts = np.zeros((n, 4), np.int64)
+
+
+def _columns(out: _Outputs, w: int, sequence: int, settings: RolloutSettings) -> dict[str, NDArray[Any]]:
+    floats, ints = out.floats[w], out.ints[w]
+    event = ints[:, 0].astype(np.uint8)
+    step = ints[:, 2].copy()
+    columns: dict[str, NDArray[Any]] = {"scan": out.scan[w]}
+    if settings.rings:
+        columns["rings"] = scan_to_rings(out.scan[w])
+    columns |= {
+        "robot_state": np.ascontiguousarray(floats[:, _STATE]),
+        "action": np.ascontiguousarray(floats[:, _ACTION]),
+        "reward": floats[:, _REWARD].copy(),
+        "is_first": step == 0,
+        "is_last": event > 0,
+        "is_terminal": _TERMINAL[event],
+        "event": event,
+        "sequence": np.full(settings.length, sequence, np.int32),
+        "episode": ints[:, 1].copy(),
+        "step": step,
+        "robot_pose": np.ascontiguousarray(floats[:, _POSE]),
+        "robot_radius": floats[:, _RADIUS].copy(),
+    }
+    if settings.humans:
+        columns["humans"] = out.humans[w]
+    return columns
+
+
+def _worlds(out: _Outputs, w: int, sequence: int) -> dict[str, NDArray[Any]]:
+    n_episodes, n_corners, n_polygons, n_humans = out.counts[w]
+    e = out.episodes[w, :n_episodes]
+    h = out.table[w, :n_humans]
+
+    def offsets(sizes: NDArray[Any]) -> NDArray[np.int64]:
+        return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+
+    return {
+        "sequence": np.full(n_episodes, sequence, np.int32),
+        "episode": np.arange(n_episodes, dtype=np.int32),
+        "row": e[:, 0].astype(np.int32),
+        "robot_start": e[:, 1:4].astype(np.float32),
+        "robot_goal": e[:, 4:6].astype(np.float32),
+        "robot_v_pref": e[:, 6].astype(np.float32),
+        "has_border": e[:, 7] > 0.5,
+        "vertices": out.corners[w, :n_corners].copy(),
+        "polygon_offset": offsets(out.sizes[w, :n_polygons]),
+        "episode_polygon_offset": offsets(e[:, 8]),
+        "human_offset": offsets(e[:, 9]),
+        "human_start": h[:, 0:3].copy(),
+        "human_goal": h[:, 3:5].copy(),
+        "human_v_pref": h[:, 5].copy(),
+        "human_sees_robot": h[:, 6] > 0.5,
+        "human_gait": h[:, 7:10].copy(),
+    }
+
+
+SequenceRows = tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]
+"""Columns of one sequence and the static side of its episodes."""
+
+
+class ScriptedRollout:
+    """Roll out sequences under a scripted policy, entirely inside the kernels.
+
+    Parameters
+    ----------
+    config : SimConfig
+        The environment.
+    settings : RolloutSettings
+        Length and columns.
+    policy : ScriptedPolicy
+        The robot's policy.
+    seed : int
+        The dataset's seed; sequence i draws from the stream (seed, i) alone.
+    """
+
+    batch = 1
+
+    def __init__(self, config: SimConfig, settings: RolloutSettings, policy: ScriptedPolicy, seed: int) -> None:
+        self.arrays = WorldArrays(config, 1)
+        self.settings = settings
+        self.seed = check_seed(seed)
+        self._out = _Outputs(config, settings, 1)
+        _prepare(self.arrays, settings)
+        self.arrays.flags[lay.F_POLICY] = SCRIPTED[policy.name]
+        self.arrays.params[lay.P_STUCK_SPEED] = policy.stuck_speed
+        self.arrays.params[lay.P_OMEGA_NOISE] = policy.omega_noise
+        self.arrays.params[lay.P_POLICY_SPEED] = policy.speed
+
+    def run(self, sequences: Sequence[int]) -> list[SequenceRows]:
+        """Return the rows of one sequence; the arrays are overwritten by the next call."""
+        (sequence,) = sequences
+        a, out = self.arrays, self._out
+        seed_worlds(a.rng, a.scalars, self.seed, sequence)
+        ok = rollout_sequence(
+            a.agents[0], a.agents32, a.scalars[0], a.vertices[0], a.polygon_start[0], a.edges[0], a.obst_f[0],
+            a.obst_i[0], a.boxes, a.rng[0], a.circles, a.dirs, a.inv_work, a.owner_work, a.hits[0], a.scans[0],
+            a.work_f, a.work_i, a.moves, a.params, a.flags, a.orca_params,
+            out.scan[0], out.floats[0], out.ints[0], out.humans[0], out.episodes[0], out.corners[0], out.sizes[0],
+            out.table[0], out.counts[0],
+        )  # fmt: skip
+        if not ok:
+            raise _no_world(a.config, sequence)
+        return [(_columns(out, 0, sequence, self.settings), _worlds(out, 0, sequence))]
+
+
+class CallableRollout:
+    """Roll out sequences under a Python policy, a fixed group of them at a time.
+
+    Parameters
+    ----------
+    config, settings, seed
+        As for :class:`ScriptedRollout`.
+    policy : callable
+        ``policy(scan, robot_state) -> action``, see :data:`PolicyFunction`. If it has a method ``reset``, that is
+        called as ``reset(batch_size=B)`` at the start of a group and ``reset(mask=...)`` where new episodes begin.
+    batch : int
+        Sequences per group. The policy always sees exactly this many rows (the last group is filled up with copies of
+        its first world), so that a network's numbers never depend on how many sequences there are.
+    """
+
+    def __init__(
+        self, config: SimConfig, settings: RolloutSettings, policy: PolicyFunction, seed: int, batch: int = 64
+    ) -> None:
+        self.config = config
+        self.settings = settings
+        self.policy = policy
+        self.seed = check_seed(seed)
+        self.batch = batch
+        self._arrays: WorldArrays | None = None
+        self._out: _Outputs | None = None
+
+    def run(self, sequences: Sequence[int]) -> list[SequenceRows]:
+        """Return the rows of consecutive sequences, in order; the arrays are overwritten by the next call."""
+        n = len(sequences)
+        if self._arrays is None or self._out is None or self._arrays.agents.shape[0] != n:
+            self._arrays = WorldArrays(self.config, n)
+            self._out = _Outputs(self.config, self.settings, n)
+            _prepare(self._arrays, self.settings)
+        a, out = self._arrays, self._out
+        seed_worlds(a.rng, a.scalars, self.seed, sequences[0])
+        out.counts[:] = 0
+        everything = np.ones(n, np.bool_)
+        if not reset_worlds(
+            everything, a.agents, a.scalars, a.vertices, a.polygon_start, a.edges, a.obst_f, a.obst_i, a.boxes,
+            a.rng, a.params, a.flags,
+        ):  # fmt: skip
+            raise _no_world(a.config, sequences[0])
+        pending = np.zeros(n, np.int64)
+        gave_up = np.zeros(n, np.bool_)
+        result = np.zeros(2)
+        length = self.settings.length
+        reset = getattr(self.policy, "reset", None)
+        if reset is not None:
+            reset(batch_size=self.batch)
+        for row in range(length):
+            begin_rows(
+                row, a.agents, a.scalars, a.vertices, a.polygon_start, a.edges, a.circles, a.dirs, a.inv_work,
+                a.owner_work, a.hits, a.scans, a.params, a.flags, out.scan, out.floats, out.ints, out.humans,
+                out.episodes, out.corners, out.sizes, out.table, out.counts,
+            )  # fmt: skip
+            first = out.ints[:, row, 2] == 0
+            if reset is not None and row > 0 and first.any():
+                reset(mask=self._fill_up(first))
+            actions = np.zeros((n, ACTION_SIZE))
+            if row < length - 1:
+                actions[:] = self._act(a.scans, out.floats[:, row, _STATE])
+            if not finish_rows(
+                row, length, pending, gave_up, actions, a.agents, a.agents32, a.scalars, a.vertices, a.polygon_start,
+                a.edges, a.obst_f, a.obst_i, a.boxes, a.rng, a.params, a.flags, a.orca_params, a.work_f, a.work_i,
+                a.moves, result, out.floats, out.ints,
+            ):  # fmt: skip
+                raise _no_world(a.config, sequences[0])
+        return [(_columns(out, w, s, self.settings), _worlds(out, w, s)) for w, s in enumerate(sequences)]
+
+    def _act(self, scans: NDArray[np.float32], states: NDArray[np.float32]) -> NDArray[np.float64]:
+        actions = np.asarray(self.policy(self._fill_up(scans), self._fill_up(states)), np.float64)
+        n = self.batch
+        if actions.shape == (n, 2):
+            actions = np.concatenate([actions, np.zeros((n, 1))], axis=1)
+        if actions.shape != (n, ACTION_SIZE):
+            raise PolicyError(
+                f"The policy returned shape {actions.shape}, expected ({n}, 3) or ({n}, 2): vx, vy [m/s] and omega [rad/s]."
+            )
+        if not np.isfinite(actions).all():
+            raise PolicyError("The policy returned NaN or infinity, expected finite velocities [m/s, m/s, rad/s].")
+        return actions[: scans.shape[0]]
+
+    def _fill_up(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """Return a copy of `rows` with exactly `batch` rows."""
+        missing = self.batch - rows.shape[0]
+        return np.concatenate([rows, np.repeat(rows[:1], missing, axis=0)])
+
+
+def _prepare(arrays: WorldArrays, settings: RolloutSettings) -> None:
+    arrays.flags[lay.F_SCAN_MM] = settings.scan_dtype == "uint16"
+    arrays.flags[lay.F_WANT_HUMANS] = settings.humans
+
+
+def _no_world(config: SimConfig, sequence: int) -> SimulationError:
+    return SimulationError(
+        f"No world for sequence {sequence} fits {lay.MAX_OBSTACLE_EDGES} obstacle edges with "
+        f"obstacles={config.obstacles}; ask for fewer obstacles."
+    )

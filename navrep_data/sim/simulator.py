@@ -1,0 +1,246 @@
+"""NavRepSim for many independent worlds at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from navrep_data.errors import ConfigError, SimulationError
+from navrep_data.schema import ACTION_SIZE, HUMAN_FIELDS, ROBOT_STATE_SIZE, Event
+from navrep_data.sim import _batch, _step
+from navrep_data.sim import _layout as lay
+from navrep_data.sim._geometry import swept_clearance
+from navrep_data.sim._obstacles import OF_FIELDS, OI_FIELDS
+from navrep_data.sim._orca import make_orca_work
+from navrep_data.sim.config import SimConfig, kernel_flags, kernel_params, orca_params
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+
+MAX_SEED = 2**63 - 1
+
+
+def check_seed(seed: int) -> int:
+    """Return `seed` if it can start a stream: a whole number from 0 to 2^63 - 1."""
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed <= MAX_SEED:
+        raise ConfigError(f"seed is {seed!r}, expected a whole number from 0 to {MAX_SEED}.")
+    return int(seed)
+
+
+def ray_directions(config: SimConfig) -> F64:
+    """Return cosine and sine of every ray's angle in the robot frame, shape (2, n_rays)."""
+    angles = config.sensor.angle_min + np.arange(config.sensor.n_rays) * config.sensor.angle_increment
+    return np.ascontiguousarray(np.stack([np.cos(angles), np.sin(angles)]))
+
+
+class WorldArrays:
+    """The packed state of a batch of worlds and the scratch space of the kernels; see ``_layout`` for the columns."""
+
+    def __init__(self, config: SimConfig, n_worlds: int) -> None:
+        agents = config.max_humans + 1
+        polygons = config.max_polygons
+        corners = 4 * polygons
+        rays = config.sensor.n_rays
+        n = n_worlds
+        self.config = config
+        self.params = kernel_params(config)
+        self.flags = kernel_flags(config)
+        self.orca_params = orca_params(config)
+        self.dirs = ray_directions(config)
+        # per world
+        self.agents = np.zeros((n, agents, lay.AGENT_FIELDS))
+        self.scalars = np.zeros((n, lay.SCALAR_FIELDS))
+        self.vertices = np.zeros((n, corners, 2))
+        self.polygon_start = np.zeros((n, polygons + 1), np.int64)
+        self.edges = np.zeros((n, corners, 4))
+        self.obst_f = np.zeros((n, 1, OF_FIELDS, lay.MAX_OBSTACLE_EDGES), np.float32)
+        self.obst_i = np.zeros((n, 1, OI_FIELDS, lay.MAX_OBSTACLE_EDGES), np.int32)
+        self.rng = np.zeros((n, lay.RNG_WORDS), np.uint64)
+        self.hits = np.zeros((n, max(1, config.max_humans)), np.int32)
+        self.scans = np.zeros((n, rays), np.float32)
+        # scratch, shared by all worlds
+        self.agents32 = np.zeros((agents, 6), np.float32)
+        self.boxes = np.zeros((polygons, 4))
+        self.circles = np.zeros((2 * agents, 4))
+        self.inv_work = np.zeros(rays)
+        self.owner_work = np.zeros(rays, np.int32)
+        self.moves = np.zeros((agents, 2))
+        self.work_f, self.work_i = make_orca_work(lay.MAX_OBSTACLE_EDGES, agents)
+
+
+@dataclass(frozen=True)
+class WorldState:
+    """A copy of one world, for drawing and analysis; everything in the world frame.
+
+    Attributes
+    ----------
+    robot : ndarray of shape (7,)
+        x, y [m], theta [rad], goal x, goal y [m], radius [m], preferred speed [m/s].
+    humans : ndarray of shape (n, 10)
+        x, y [m], vx, vy [m/s], theta [rad], goal x, goal y [m], radius [m], preferred speed [m/s], sees the robot.
+    polygons : list of ndarray of shape (k, 2)
+        Corners [m]; anticlockwise = solid inside, clockwise = border (solid outside).
+    circles : ndarray of shape (m, 3)
+        What the lidar sees of the humans: x, y, radius [m].
+    step : int
+        Steps since reset.
+    """
+
+    robot: F64
+    humans: F64
+    polygons: list[F64]
+    circles: F64
+    step: int
+
+
+class Simulator:
+    """A batch of independent worlds that step together.
+
+    Parameters
+    ----------
+    config : SimConfig
+        Environment, physics and sensor, for example from :func:`make_config`.
+    n_worlds : int
+        Number of worlds.
+    seed : int
+        World w draws from the stream of (seed, first_sequence + w) and nothing else.
+    first_sequence : int
+        Index of the first world's stream.
+
+    Raises
+    ------
+    ConfigError
+        If a value is out of range.
+
+    Notes
+    -----
+    Worlds do not end by themselves: :meth:`step` reports events, the caller resets. An action is the body velocity
+    command (vx, vy [m/s], omega [rad/s]) and is executed as given.
+    """
+
+    def __init__(self, config: SimConfig, n_worlds: int = 1, seed: int = 0, first_sequence: int = 0) -> None:
+        if n_worlds < 1:
+            raise ConfigError(f"n_worlds is {n_worlds!r}, expected at least 1.")
+        self.config = config
+        self.n_worlds = n_worlds
+        self.arrays = WorldArrays(config, n_worlds)
+        _batch.seed_worlds(self.arrays.rng, self.arrays.scalars, check_seed(seed), check_seed(first_sequence))
+        self.reset()
+
+    def reset(self, mask: ArrayLike | None = None) -> None:
+        """Start the next episode, in all worlds or in those where `mask` (W,) is True."""
+        a = self.arrays
+        chosen = np.ones(self.n_worlds, np.bool_) if mask is None else np.asarray(mask, np.bool_)
+        if chosen.shape != (self.n_worlds,):
+            raise ConfigError(f"mask has shape {chosen.shape}, expected ({self.n_worlds},).")
+        ok = _batch.reset_worlds(
+            chosen, a.agents, a.scalars, a.vertices, a.polygon_start, a.edges, a.obst_f, a.obst_i, a.boxes, a.rng,
+            a.params, a.flags,
+        )  # fmt: skip
+        if not ok:
+            raise SimulationError(
+                f"No world with obstacles={self.config.obstacles} fits {lay.MAX_OBSTACLE_EDGES} obstacle edges; "
+                "ask for fewer obstacles."
+            )
+
+    def step(self, actions: ArrayLike) -> tuple[F64, NDArray[np.uint8]]:
+        """Advance all worlds by one time step.
+
+        Parameters
+        ----------
+        actions : array_like of shape (W, 3)
+            Body velocity commands: vx, vy [m/s], omega [rad/s].
+
+        Returns
+        -------
+        rewards : ndarray of shape (W,)
+            Reward of this step.
+        events : ndarray of shape (W,), uint8
+            :class:`navrep_data.schema.Event` codes; 0 = the episode goes on.
+        """
+        a = self.arrays
+        commands = np.ascontiguousarray(actions, np.float64)
+        if commands.shape != (self.n_worlds, ACTION_SIZE):
+            raise ConfigError(f"actions have shape {commands.shape}, expected ({self.n_worlds}, {ACTION_SIZE}).")
+        if not np.isfinite(commands).all():
+            raise ConfigError("actions hold NaN or infinity, expected finite velocities.")
+        rewards = np.zeros(self.n_worlds)
+        events = np.zeros(self.n_worlds, np.uint8)
+        _batch.step_worlds(
+            commands, a.agents, a.agents32, a.scalars, a.edges, a.polygon_start, a.obst_f, a.obst_i, a.params,
+            a.orca_params, a.work_f, a.work_i, a.moves, rewards, events,
+        )  # fmt: skip
+        return rewards, events
+
+    def observe(self) -> tuple[F32, F32]:
+        """Return scans (W, n_rays) [m] and robot states (W, 5), both float32, of the present state.
+
+        Robot state: goal x, goal y [m], vx, vy [m/s], omega [rad/s] in the robot frame.
+        """
+        a = self.arrays
+        states = np.zeros((self.n_worlds, ROBOT_STATE_SIZE), np.float32)
+        _batch.observe_worlds(
+            a.agents, a.scalars, a.edges, a.polygon_start, a.circles, a.dirs, a.inv_work, a.owner_work, a.hits,
+            a.params, a.flags, a.scans, states,
+        )  # fmt: skip
+        return a.scans.copy(), states
+
+    def humans(self) -> F32:
+        """Return what the `humans` column would hold now: (W, max_humans, 6) float32, NaN-padded.
+
+        `visible` is that of the last :meth:`observe`.
+        """
+        a = self.arrays
+        out = np.zeros((self.n_worlds, self.config.max_humans, len(HUMAN_FIELDS)), np.float32)
+        for w in range(self.n_worlds):
+            _step.observe_humans(a.agents[w], int(a.scalars[w, lay.S_HUMANS]), a.hits[w], out[w])
+        return out
+
+    def clearance(self, points: ArrayLike, world: int = 0) -> F64:
+        """Return how far points (N, 2) are from solid static matter [m], world frame; negative inside it.
+
+        A robot of radius r at a point is free of obstacles where this is at least r.
+        """
+        a = self.arrays
+        n = int(a.scalars[world, lay.S_POLYGONS])
+        where = np.atleast_2d(np.asarray(points, np.float64))
+        edges, start = a.edges[world], a.polygon_start[world]
+        return np.array([swept_clearance(x, y, x, y, edges, start, n) for x, y in where])
+
+    def state(self, world: int = 0) -> WorldState:
+        """Return a copy of one world's state."""
+        a = self.arrays
+        n = int(a.scalars[world, lay.S_HUMANS])
+        agents = a.agents[world]
+        columns = [lay.A_X, lay.A_Y, lay.A_HEADING, lay.A_GX, lay.A_GY, lay.A_RADIUS, lay.A_VPREF]
+        human_columns = [
+            lay.A_X, lay.A_Y, lay.A_VX, lay.A_VY, lay.A_HEADING, lay.A_GX, lay.A_GY, lay.A_RADIUS, lay.A_VPREF,
+            lay.A_SEES,
+        ]  # fmt: skip
+        starts = a.polygon_start[world, : int(a.scalars[world, lay.S_POLYGONS]) + 1]
+        count = _step.fill_circles(agents, n, a.flags[lay.F_LEGS] != 0, a.circles)
+        return WorldState(
+            robot=agents[0, columns].copy(),
+            humans=agents[1 : n + 1, human_columns].copy(),
+            polygons=[a.vertices[world, i:j].copy() for i, j in zip(starts[:-1], starts[1:], strict=True)],
+            circles=a.circles[:count, :3].copy(),
+            step=int(a.scalars[world, lay.S_STEP]),
+        )
+
+    def describe_event(self, code: int) -> str:
+        """Return the name of an event code."""
+        return Event(int(code)).label
+
+    def __repr__(self) -> str:
+        """Name the environment, the physics and the size of the batch."""
+        return f"Simulator({self.config.env}, {self.config.physics}, n_worlds={self.n_worlds})"
+
+
+def warm_up() -> Any:
+    """Compile, or load from numba's cache, what a simulator needs."""
+    simulator = Simulator(SimConfig(humans=2, obstacles=1))
+    simulator.step(np.zeros((1, ACTION_SIZE)))
+    return simulator.observe()

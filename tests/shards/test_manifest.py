@@ -1,0 +1,247 @@
+"""The manifest, the lock, the folder and the card."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from navrep_data.errors import (
+    ConfigError,
+    CorruptDataError,
+    DatasetLockedError,
+    DatasetNotFoundError,
+    SchemaVersionError,
+)
+from navrep_data.io import json_bytes
+from navrep_data.schema import Event
+from navrep_data.shards import (
+    SPLITS,
+    DatasetFolder,
+    Manifest,
+    chunk_rows,
+    dataset_card,
+    default_splits,
+    estimate_bytes,
+    info,
+    split_of,
+    writer_lock,
+)
+from navrep_data.shards.manifest import _hash
+
+from .synthetic import ALL_COLUMNS, MAX_HUMANS, make_dataset, make_sequence
+
+
+def test_round_trip_in_equal_bytes(dataset):
+    before = (dataset / "manifest.json").read_bytes()
+    manifest = Manifest.read(dataset)
+    assert manifest.save(dataset, card=dataset_card(manifest)) == manifest
+    assert (dataset / "manifest.json").read_bytes() == before
+    assert json.loads(before)["rows"] == 600
+    assert {"file", "sha256", "rows"} <= set(json.loads(before)["shards"][0])
+
+
+def test_a_dataset_is_a_function_of_its_input(dataset, tmp_path):
+    make_dataset(tmp_path / "again")
+    for path in dataset.rglob("*"):
+        if path.is_file():
+            assert (tmp_path / "again" / path.relative_to(dataset)).read_bytes() == path.read_bytes()
+
+
+def test_default_splits_are_stable_and_cover_everything():
+    for n in (0, 1, 3, 10, 57):
+        splits = default_splits(n)
+        where = {k: name for name, ranges in splits.items() for a, b in ranges for k in range(a, b)}
+        assert sorted(where) == list(range(n))
+        later = default_splits(n + 13)
+        assert all(
+            any(a <= k < b for a, b in later[name]) and name == split_of(k) for k, name in where.items()
+        )
+    assert all(default_splits(3)[name] for name in SPLITS)
+
+
+def change(root, edit, sign=True):
+    values = json.loads((root / "manifest.json").read_text())
+    edit(values)
+    if sign:
+        values["manifest_sha256"] = _hash(values)
+    (root / "manifest.json").write_bytes(json_bytes(values))
+
+
+@pytest.mark.parametrize(
+    ("edit", "match"),
+    [
+        (lambda v: v.update(format="minari"), "'format'"),
+        (lambda v: v.update(format_version="1"), "'format_version' is '1'"),
+        (lambda v: v.update(format_version=True), "'format_version'"),
+        (lambda v: v.pop("env"), "'env' is 'missing'"),
+        (lambda v: v.update(seed=-1), "'seed' is -1"),
+        (lambda v: v.update(complete=1), "'complete' is 1"),
+        (lambda v: v.update(length=0), "'length'"),
+        (lambda v: v.update(columns=["scan", "virus"]), "'columns'"),
+        (lambda v: v.update(columns=v["columns"][::-1]), "'columns'"),
+        (lambda v: v.update(columns=[[]]), "'columns'"),
+        (lambda v: v.update(scan_dtype="int8"), "'scan_dtype'"),
+        (lambda v: v.update(max_humans=10**9), "'max_humans'"),
+        (lambda v: v["sensor"].update(n_rays=10**9), "'sensor'"),
+        (lambda v: v["sensor"].pop("dt"), "'sensor'"),
+        (lambda v: v.update(statistics={"columns": {}}), "'statistics'"),
+        (lambda v: v.update(splits={"train": [[3, 1]]}), "'splits'"),
+        (lambda v: v.update(splits={"train": [[0, 2]], "val": [[1, 2]]}), "two splits"),
+        (lambda v: v.update(splits={"all": [[0, 6]]}), "named"),
+        (lambda v: v.update(splits={"train": [[0, 7]]}), "holds sequence 6"),
+        (lambda v: v["shards"][0].update(file="../../etc/passwd"), "outside the dataset"),
+        (lambda v: v["shards"][0].update(file="/etc/passwd"), "outside the dataset"),
+        (lambda v: v["shards"][0]["worlds"].update(file="worlds/../../x"), "outside the dataset"),
+        (lambda v: v["shards"][0].update(sha256="0" * 63), r"'shards\[0\].sha256'"),
+        (lambda v: v["shards"][1].update(bytes=-4), r"'shards\[1\].bytes'"),
+        (lambda v: v["shards"][1].update(sequences=[3, 3]), r"'shards\[1\].sequences'"),
+        (lambda v: v["shards"][1].update(sequence_hashes=[]), "sequence_hashes"),
+        (lambda v: v["shards"][1].update(statistics=None), "statistics"),
+        (lambda v: v["shards"][0].update(rows=10**9), "rows for 3 sequences"),
+        (lambda v: v["shards"].reverse(), "another shard|missing"),
+        (lambda v: v["shards"].pop(0), "missing in a complete"),
+        (lambda v: v["shards"].pop(), "complete with 3 of 6|holds sequence"),
+        (lambda v: v["shards"][1].update(file=v["shards"][0]["file"]), "twice"),
+        (lambda v: v.update(shards=[3]), "not a JSON object"),
+        (lambda v: v.update(rows=1), "not the sums"),
+        (lambda v: v.update(card_sha256=3), "'card_sha256'"),
+    ],
+)
+def test_hostile_manifests_are_refused(dataset, edit, match):
+    change(dataset, edit)
+    with pytest.raises(CorruptDataError, match=match) as error:
+        Manifest.read(dataset)
+    assert "\n" not in str(error.value)
+
+
+def test_changed_values_break_the_hash(dataset):
+    change(dataset, lambda v: v.update(env="soadr1"), sign=False)
+    with pytest.raises(CorruptDataError, match="manifest_sha256"):
+        Manifest.read(dataset)
+
+
+def test_missing_broken_and_newer(dataset, tmp_path, monkeypatch):
+    with pytest.raises(DatasetNotFoundError, match="not a folder"):
+        Manifest.read(tmp_path / "none")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DatasetNotFoundError, match=r"no manifest\.json"):
+        Manifest.read(tmp_path / "empty")
+    change(dataset, lambda v: v.update(format_version=2))
+    with pytest.raises(SchemaVersionError, match="pip install -U navrep-data"):
+        Manifest.read(dataset)
+    for text in (b"{", b"[]", b"null", b"\xff\xfe", b"[" * 100_000, b'{"a": NaN}'):
+        (dataset / "manifest.json").write_bytes(text)
+        with pytest.raises(CorruptDataError):
+            Manifest.read(dataset)
+    with open(dataset / "manifest.json", "wb") as handle:
+        handle.truncate(300 << 20)  # sparse: refused before it is read
+    with pytest.raises(ValueError, match="expected at most"):
+        Manifest.read(dataset)
+
+
+def test_shards_may_come_in_any_order_with_gaps_until_complete(dataset):
+    manifest = Manifest.read(dataset)
+    back = manifest.with_shards(reversed(manifest.shards), complete=True)
+    assert replace(back, card_sha256=manifest.card_sha256) == manifest
+    part = manifest.with_shards(manifest.shards[1:], complete=False).save(dataset)
+    assert Manifest.read(dataset) == part
+    assert part.sequences == 3
+    with pytest.raises(ConfigError, match="missing"):
+        manifest.with_shards(manifest.shards[1:], complete=True)
+    with pytest.raises(ConfigError, match="another shard"):
+        manifest.with_shards([*manifest.shards, manifest.shards[0]], complete=True)
+
+
+def test_second_writer_is_refused_and_a_killed_one_is_not(dataset):
+    code = (
+        "import sys, time\nfrom navrep_data.shards import writer_lock\n"
+        "with writer_lock(sys.argv[1]):\n    print('held', flush=True)\n    time.sleep(60)"
+    )
+    root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+    process = subprocess.Popen([sys.executable, "-c", code, str(dataset)], stdout=subprocess.PIPE, cwd=root)
+    try:
+        assert process.stdout.readline() == b"held\n"
+        with pytest.raises(DatasetLockedError, match="one writer at a time"), writer_lock(dataset):
+            pass
+    finally:
+        process.kill()
+        process.communicate()
+    with writer_lock(dataset):
+        pass
+    with writer_lock(dataset):
+        pass
+
+
+def test_folder_reads_and_indexes(dataset):
+    folder = DatasetFolder(dataset, max_open=1)
+    episodes = folder.episodes
+    expected = []
+    for k in range(6):
+        columns, _ = make_sequence(k)
+        starts = np.flatnonzero(columns["is_first"])
+        for start, stop in zip(starts, [*starts[1:], 100], strict=True):
+            split = SPLITS.index(split_of(k))
+            where = (k, columns["episode"][start], k // 3, start + 100 * (k % 3))
+            expected.append((*where, stop - start, columns["event"][stop - 1], split))
+            got = folder.read("robot_state", k // 3, start + 100 * (k % 3), stop + 100 * (k % 3))
+            assert np.array_equal(got, columns["robot_state"][start:stop])
+    names = ("sequence", "episode", "shard", "start", "length", "event", "split")
+    assert [tuple(row) for row in zip(*(getattr(episodes, n) for n in names), strict=True)] == expected
+    assert set(episodes.event) <= set(Event)
+    assert len(episodes.in_split("val")) + len(episodes.in_split("test")) + len(
+        episodes.in_split("train")
+    ) == len(expected)
+    with pytest.raises(ConfigError, match="Did you mean 'train'"):
+        episodes.in_split("trian")
+    again = pickle.loads(pickle.dumps(folder))  # noqa: S301
+    assert np.array_equal(again.read("scan", 1, 5, 9), folder.read("scan", 1, 5, 9))
+    worlds = folder.worlds(1)
+    assert [worlds.episode(k).row for k in range(len(worlds))] == [r[3] for r in expected if r[2] == 1]
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs /proc")
+def test_open_files_are_bounded(tmp_path):
+    make_dataset(tmp_path, 12, 1, 20)
+    before = len(os.listdir("/proc/self/fd"))
+    with DatasetFolder(tmp_path, max_open=3) as folder:
+        for k in [*range(12), *range(12)]:
+            folder.read("scan", k, 0, 20)
+            assert len(os.listdir("/proc/self/fd")) <= before + 4
+    assert len(os.listdir("/proc/self/fd")) <= before
+
+
+def test_info_and_card(dataset):
+    values = info(dataset)
+    assert json.loads(json.dumps(values)) == values
+    assert values["rows"] == 600
+    assert values["splits"] == {"train": 4, "val": 1, "test": 1}
+    files = [p for folder in ("data", "worlds") for p in (dataset / folder).iterdir()]
+    assert values["bytes"] == sum(p.stat().st_size for p in files)
+    card = (dataset / "README.md").read_text()
+    assert card.startswith("---\nlicense: mit\n")
+    assert all(f"| `{name}` |" in card for name in ALL_COLUMNS)
+    assert "navrep-data generate --env soadrl --n 6" in card
+    assert "not made or endorsed by the NavRep authors" in " ".join(card.split())
+
+
+def test_card_of_a_dataset_without_optional_parts(tmp_path):
+    columns = tuple(c for c in ALL_COLUMNS if c not in ("rings", "humans"))
+    manifest = make_dataset(tmp_path, 1, 1, 40, worlds=False, scan_dtype="float32", columns=columns)
+    assert "| `scan` | (1080,) float32 | m |" in dataset_card(manifest)
+    assert "Humans per episode" not in dataset_card(manifest)
+
+
+def test_estimate_is_near_for_full_size_columns():
+    kwargs = {"n_rays": 1080, "scan_dtype": "uint16", "max_humans": 30}
+    assert 1_600_000_000 < estimate_bytes(ALL_COLUMNS, 1_000_000, **kwargs) < 2_200_000_000
+    less = estimate_bytes(("scan", "reward"), 1_000_000, **kwargs)
+    assert less < estimate_bytes(ALL_COLUMNS, 1_000_000, **kwargs)
+    assert MAX_HUMANS < 30
+    assert chunk_rows(1000) == 20
