@@ -10,13 +10,11 @@ from types import ModuleType
 
 from navrep_data._version import __version__
 
-_LAZY = ("datasets", "errors", "generate", "io", "observations", "schema", "shards", "sim", "testing")
-
-__all__ = ["__version__", *_LAZY]
+__all__ = ["__version__", "datasets", "errors", "generate", "io", "observations", "schema", "shards", "sim", "testing"]
 
 
 def __getattr__(name: str) -> ModuleType:
-    if name in _LAZY:
+    if name in __all__:
         return importlib.import_module(f"navrep_data.{name}")
     raise AttributeError(f"module 'navrep_data' has no attribute {name!r}")
 

@@ -1,6 +1,7 @@
 """ORCA the slow way: plain Python over float32 pairs, with linked edges and a tree that is really walked.
 
-Shares nothing with the kernels: objects instead of arrays, recursion instead of stacks, branches instead of selects.
+Shares nothing with the kernels: objects instead of arrays, recursion instead of stacks, branches instead of
+selects.
 """
 
 from __future__ import annotations
@@ -327,7 +328,9 @@ def program3(lines, n_obstacle, begin, radius, best):
     return best
 
 
-def orca_velocities(positions, velocities, radii, max_speeds, preferred, polygons=(), settings=(10, 10, 5, 5, 0.2)):
+def orca_velocities(
+    positions, velocities, radii, max_speeds, preferred, polygons=(), settings=(10, 10, 5, 5, 0.2)
+):
     """Return (N, 2) float32 new velocities; `settings` as in RVO2: distance, number, horizons, time step."""
     neighbor_dist, most, tau, tau_obst, dt = settings
     with np.errstate(all="ignore"):
@@ -349,7 +352,8 @@ def orca_velocities(positions, velocities, radii, max_speeds, preferred, polygon
             for j in agent_neighbors(i, position, f32(neighbor_dist), most):
                 lines.append(
                     agent_line(
-                        p, v, radius, position[j], V(*velocities[j]), f32(radii[j]), f32(1) / f32(tau), f32(1) / f32(dt)
+                        p, v, radius, position[j], V(*velocities[j]), f32(radii[j]),
+                        f32(1) / f32(tau), f32(1) / f32(dt),
                     )
                 )  # fmt: skip
             failed, best = program2(lines, speed, V(*preferred[i]), False)

@@ -26,31 +26,45 @@ def generate_command(
     n: Annotated[int, typer.Option("--n", help="Number of sequences of --length rows.")] = 100,
     out: Annotated[Path | None, typer.Option("--out", help="Dataset folder.", show_default="data/<env>")] = None,
     seed: Annotated[int, typer.Option("--seed", help="Same seed and settings, same bytes.")] = 0,
-    workers: Annotated[
-        int | None, typer.Option("--workers", help="Processes.", show_default="number of cores")
-    ] = None,
+    workers: Annotated[int | None, typer.Option("--workers", help="Processes.", show_default="number of cores")] = None,
     length: Annotated[int, typer.Option("--length", help="Rows per sequence (0.2 s each).")] = 1000,
     physics: Annotated[
         str | None, typer.Option("--physics", help="How worlds behave.", show_default="consistent")
     ] = None,
     humans: Annotated[
-        int | None, typer.Option("--humans", help="Mean number of humans; an episode has half to 1.5 times as many.", show_default="the environment's")
+        int | None,
+        typer.Option(
+            "--humans",
+            help="Mean number of humans; an episode has half to 1.5 times as many.",
+            show_default="the environment's",
+        ),
     ] = None,
     obstacles: Annotated[
-        int | None, typer.Option("--obstacles", help="Most squares, and most walls, in an episode.", show_default="the environment's")
+        int | None,
+        typer.Option(
+            "--obstacles",
+            help="Most squares, and most walls, in an episode.",
+            show_default="the environment's",
+        ),
     ] = None,
     legs: Annotated[bool, typer.Option("--legs/--trunk", help="What the lidar sees of a human.")] = True,
     policy: Annotated[
-        str, typer.Option("--policy", help="orca, goal-momentum, random-momentum, constant-velocity, or your own module:function.")
+        str,
+        typer.Option(
+            "--policy",
+            help="orca, goal-momentum, random-momentum, constant-velocity, or your own module:function.",
+        ),
     ] = "orca",
     policy_batch: Annotated[
         int, typer.Option("--policy-batch", help="Batch size that a module:function policy always sees.")
     ] = 64,
     shard_size: Annotated[
-        int | None, typer.Option("--shard-size", help="Sequences per shard.", show_default="20,000 rows' worth")
+        int | None,
+        typer.Option("--shard-size", help="Sequences per shard.", show_default="20,000 rows' worth"),
     ] = None,
     scan_dtype: Annotated[
-        str | None, typer.Option("--scan-dtype", help="uint16 (millimetres) or float32 (metres).", show_default="uint16")
+        str | None,
+        typer.Option("--scan-dtype", help="uint16 (millimetres) or float32 (metres).", show_default="uint16"),
     ] = None,
     rings: Annotated[bool, typer.Option("--rings/--no-rings", help="Store the rings column.")] = True,
     humans_column: Annotated[

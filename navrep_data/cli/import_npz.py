@@ -12,7 +12,8 @@ from navrep_data.cli._common import print_json, say
 
 def import_npz_command(
     files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="The original's *_scans_robotstates_actions_rewards_dones.npz.")
+        list[Path],
+        typer.Argument(metavar="FILE...", help="The original's *_scans_robotstates_actions_rewards_dones.npz."),
     ],
     out: Annotated[Path, typer.Option("--out", help="Dataset folder, new or empty.")],
     env: Annotated[str, typer.Option("--env", help="Name to record as the environment.")] = "imported",
@@ -23,7 +24,14 @@ def import_npz_command(
 
     manifest = import_npz(files, out, env=env)
     if as_json:
-        print_json({"rows": manifest.rows, "sequences": manifest.sequences, "shards": len(manifest.shards), "bytes": manifest.bytes})
+        print_json(
+            {
+                "rows": manifest.rows,
+                "sequences": manifest.sequences,
+                "shards": len(manifest.shards),
+                "bytes": manifest.bytes,
+            }
+        )
     else:
         say(f"{out}: {manifest.sequences} sequences, {manifest.rows:,} rows, {manifest.bytes / 1e6:.1f} MB")
         say(f"next: navrep-data info {out}")

@@ -37,6 +37,9 @@ def _print_info(root: Path, found: dict[str, Any]) -> None:
     for name, outcome in found["outcomes"].items():
         if outcome["episodes"]:
             share = 100 * outcome["episodes"] / episodes
-            say(f"  {name:20s} {outcome['episodes']:7,d} episodes {share:5.1f} %, mean length {outcome['mean_length']:.1f} rows")
+            say(
+                f"  {name:20s} {outcome['episodes']:7,d} episodes {share:5.1f} %, "
+                f"mean length {outcome['mean_length']:.1f} steps"
+            )
     say("versions: " + ", ".join(f"{name} {value}" for name, value in found["versions"].items()))
     say(f"next: navrep-data verify {root}")

@@ -14,7 +14,7 @@ def verify_command(
     root: Annotated[Path, typer.Argument(metavar="DIR", help="Dataset folder.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Check every file of a dataset: hashes, schema, index, ranges, rings against scans. Exits 1 if anything is wrong."""
+    """Check every file of a dataset: hashes, schema, index, ranges, rings. Exits 1 if anything is wrong."""
     from tqdm import tqdm
 
     from navrep_data.shards import verify

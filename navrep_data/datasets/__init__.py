@@ -1,4 +1,4 @@
-"""Datasets for PyTorch over shards: single frames, windows, a stream of windows; import of the original's files."""
+"""Datasets for PyTorch over shards: frames, windows, a stream of windows; import of the original's files."""
 
 from __future__ import annotations
 

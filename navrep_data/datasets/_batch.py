@@ -124,7 +124,9 @@ def choose_fields(lidar: str | None, fields: Any, default: tuple[str, ...], colu
                 f"Unknown field {name!r}.{did_you_mean(name, FIELDS)} Expected some of: {', '.join(FIELDS)}."
             )
         if name in STORED_FIELDS and name not in columns:
-            raise ConfigError(f"This dataset has no column {name!r}; leave it out of fields. It has: {', '.join(sorted(columns))}.")
+            raise ConfigError(
+                f"This dataset has no column {name!r}; leave it out of fields. It has: {', '.join(sorted(columns))}."
+            )
     return chosen
 
 
@@ -233,7 +235,7 @@ class Assembler:
             return real & ~self._stored(rows["is_last"], start, count)
         known = ~self._stored(rows["is_first"], start, count)
         if self.spec.stored_leading:
-            # The original stores no episode's first observation, so an action did lead to a first row, unless it is one
-            # of its rows from an episode that was never played: those have a zero action.
+            # The original stores no episode's first observation, so an action did lead to a first row, unless
+            # it is one of its rows from an episode that was never played: those have a zero action.
             known |= self._stored(rows["leading_action"], start, count).any(-1)
         return real & known

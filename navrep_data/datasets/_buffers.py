@@ -14,7 +14,7 @@ SMALL_BYTES = 256 << 10
 
 
 def _references(buffers: list[npt.NDArray[np.uint8]], position: int) -> int:
-    """Return how often a buffer of the list is referenced, plus a constant that depends on the interpreter."""
+    """Return how often a buffer is referenced, plus a constant that depends on the interpreter."""
     return sys.getrefcount(buffers[position])
 
 
@@ -32,9 +32,10 @@ class BufferPool:
 
     Notes
     -----
-    A batch of 64 windows of scans is 8.8 MB. Fresh from the operating system, its pages cost more than filling it:
-    measured 17k windows/s with new memory each time, 126k with the same memory. Tensors made by ``torch.from_numpy``
-    hold a reference to the array, and so do views, so an unreferenced buffer is one that no batch can see.
+    A batch of 64 windows of scans is 8.8 MB. Fresh from the operating system, its pages cost more than
+    filling it: measured 17k windows/s with new memory each time, 126k with the same memory. Tensors made by
+    ``torch.from_numpy`` hold a reference to the array, and so do views, so an unreferenced buffer is one that
+    no batch can see.
     """
 
     def __init__(self, keep: int = 6) -> None:
@@ -49,7 +50,8 @@ class BufferPool:
         if size < SMALL_BYTES:
             return np.empty(shape, dtype)
         with self._lock:
-            return self._take(size)[:size].view(dtype).reshape(shape)
+            array: npt.NDArray[Any] = self._take(size)[:size].view(dtype).reshape(shape)
+            return array
 
     def _take(self, size: int) -> npt.NDArray[np.uint8]:
         for position in range(len(self._buffers)):

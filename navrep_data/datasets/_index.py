@@ -120,8 +120,8 @@ def across_episodes(episodes: Episodes, window: int, stride: int) -> WindowTable
 
     Notes
     -----
-    navrep/tools/wdataset.py does so through all files put end to end; here every sequence is cut by itself, so no window
-    joins two sequences.
+    navrep/tools/wdataset.py does so through all files put end to end; here every sequence is cut by itself,
+    so no window joins two sequences.
     """
     sequences = sequences_of(episodes)
     owner, rank = _owners(np.maximum((sequences.rows - window - 2) // stride + 1, 0))

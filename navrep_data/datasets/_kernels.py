@@ -1,22 +1,29 @@
 """Copying windows of stored rows into batches, with the conversions on the way.
 
-All kernels take the stored rows of one column, ``start`` and ``count`` (first row and number of rows of each window)
-and fill ``out``, whose first two axes are window and row, completely: rows past ``count`` become zero.
+All kernels take the stored rows of one column, ``start`` and ``count`` (first row and number of rows of each
+window) and fill ``out``, whose first two axes are window and row, completely: rows past ``count`` become
+zero.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
+from typing import Any
 
-# A uint16 scan counts millimetres. Dividing (not multiplying by 0.001) gives exactly float32(k) / float32(1000), the
-# number that the stored rings were computed from.
+import numpy as np
+import numpy.typing as npt
+
+from navrep_data._kernels import kernel
+
+Array = npt.NDArray[Any]
+
+# A uint16 scan counts millimetres. Dividing (not multiplying by 0.001) gives exactly float32(k) /
+# float32(1000), the number that the stored rings were computed from.
 MM_PER_METRE = 1000
 
 
-@njit(cache=True, error_model="numpy")
-def millimetre_windows(rows, start, count, invalid, range_max, out):
-    """Millimetres (uint16) to metres (float32); a stored 0 becomes `invalid` [m]; divided by `range_max` unless 1."""
+@kernel
+def millimetre_windows(rows: Array, start: Array, count: Array, invalid: Any, range_max: Any, out: Array) -> None:
+    """Turn mm (uint16) to metres (float32), a stored 0 to `invalid` [m]; divide by `range_max` unless 1."""
     scale = np.float32(MM_PER_METRE)
     for b in range(start.size):
         first = start[b]
@@ -35,9 +42,9 @@ def millimetre_windows(rows, start, count, invalid, range_max, out):
                 out[b, t, r] = np.float32(0.0)
 
 
-@njit(cache=True, error_model="numpy")
-def metre_windows(rows, start, count, invalid, range_max, out):
-    """Metres (float32) as stored; a stored 0 becomes `invalid` [m]; divided by `range_max`."""
+@kernel
+def metre_windows(rows: Array, start: Array, count: Array, invalid: Any, range_max: Any, out: Array) -> None:
+    """Copy metres (float32), turn a stored 0 to `invalid` [m]; divide by `range_max`."""
     zero = np.float32(0.0)
     for b in range(start.size):
         first = start[b]
@@ -51,9 +58,9 @@ def metre_windows(rows, start, count, invalid, range_max, out):
                 out[b, t, r] = zero
 
 
-@njit(cache=True, error_model="numpy")
-def ring_windows(rows, start, count, out):
-    """Rings 0/1/2 (uint8, cells flattened) to 0 / 0.5 / 1 (float32)."""
+@kernel
+def ring_windows(rows: Array, start: Array, count: Array, out: Array) -> None:
+    """Turn rings 0/1/2 (uint8, cells flattened) to 0 / 0.5 / 1 (float32)."""
     for b in range(start.size):
         first = start[b]
         n = count[b]
@@ -65,9 +72,9 @@ def ring_windows(rows, start, count, out):
                 out[b, t, c] = np.float32(0.0)
 
 
-@njit(cache=True, error_model="numpy")
-def byte_windows(flat, width, start, count, out):
-    """Copy rows of `width` bytes from `flat` (rows * width,) to `out` (windows, W * width): any dtype, one kernel."""
+@kernel
+def byte_windows(flat: Array, width: int, start: Array, count: Array, out: Array) -> None:
+    """Copy rows of `width` bytes from `flat` (rows * width,) to `out` (windows, W * width): any dtype."""
     for b in range(start.size):
         first = start[b] * width
         n = count[b] * width
@@ -77,9 +84,9 @@ def byte_windows(flat, width, start, count, out):
             out[b, c] = np.uint8(0)
 
 
-@njit(cache=True, error_model="numpy")
-def leading_windows(actions, is_first, start, count, out):
-    """Action of the row before, zero where a row is the first of its episode."""
+@kernel
+def leading_windows(actions: Array, is_first: Array, start: Array, count: Array, out: Array) -> None:
+    """Copy the action of the row before, zero where a row is the first of its episode."""
     for b in range(start.size):
         first = start[b]
         n = count[b]

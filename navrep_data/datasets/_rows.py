@@ -74,7 +74,9 @@ class DiskRows:
         shard, first, size = shard[order], first[order], size[order]
         end = np.cumsum(size)
         at = end - size
-        rows = {name: self._pool.empty((int(end[-1]), *shape), dtype) for name, (dtype, shape) in self._layouts().items()}
+        rows = {
+            name: self._pool.empty((int(end[-1]), *shape), dtype) for name, (dtype, shape) in self._layouts().items()
+        }
         for mine in np.split(np.arange(len(order)), np.flatnonzero(np.diff(shard)) + 1):
             source = self.folder.shard(int(shard[mine[0]]))
             numbers = ranges(first[mine], size[mine])
@@ -110,7 +112,11 @@ class LoadedRows:
     """
 
     def __init__(
-        self, folder: DatasetFolder, columns: Sequence[str], sequences: SequenceTable, pool: BufferPool | None = None
+        self,
+        folder: DatasetFolder,
+        columns: Sequence[str],
+        sequences: SequenceTable,
+        pool: BufferPool | None = None,
     ) -> None:
         ends = np.cumsum(sequences.rows)
         self._ids = sequences.sequence

@@ -80,8 +80,8 @@ def cut(episodes: Episodes, window: int, stride: int, across: bool) -> WindowTab
     if len(table) == 0:
         longest = int(sequences_of(episodes).rows.max())
         raise ConfigError(
-            f"No window of {window} + 1 rows fits a sequence of {longest} rows that starts at row 1; expected shorter "
-            "windows with across_episodes=True. Choose window smaller, or across_episodes=False."
+            f"No window of {window} + 1 rows fits into the longest sequence, {longest} rows less the first; "
+            "expected shorter windows with across_episodes=True. Lower window, or set across_episodes=False."
         )
     return table
 
@@ -90,7 +90,13 @@ class WindowDataset(Dataset[Batch]):
     """Random access to windows; the public classes only choose what a window is."""
 
     def __init__(
-        self, root: str | os.PathLike[str], folder: DatasetFolder, episodes: Episodes, table: WindowTable, spec: BatchSpec, preload: bool
+        self,
+        root: str | os.PathLike[str],
+        folder: DatasetFolder,
+        episodes: Episodes,
+        table: WindowTable,
+        spec: BatchSpec,
+        preload: bool,
     ) -> None:
         self.root = Path(root)
         self.spec = spec
@@ -115,7 +121,8 @@ class WindowDataset(Dataset[Batch]):
         return len(self.table)
 
     def __getstate__(self) -> dict[str, Any]:
-        # Memory is shared with forked workers for free; sending it through a pickle would copy it, so a spawned one loads.
+        # Memory is shared with forked workers for free; sending it through a pickle would copy it, so a
+        # spawned one loads.
         return {**self.__dict__, "_loaded": None}
 
     def batch(self, indices: Sequence[int] | np.ndarray[Any, Any] | torch.Tensor) -> Batch:
@@ -138,11 +145,15 @@ class WindowDataset(Dataset[Batch]):
         """
         index = np.asarray(indices)
         if index.ndim != 1 or len(index) == 0 or index.dtype.kind not in "iu":
-            raise IndexError(f"indices has shape {index.shape} and dtype {index.dtype}, expected a non-empty 1-D list of int.")
+            raise IndexError(
+                f"indices has shape {index.shape} and dtype {index.dtype}, expected a non-empty 1-D list of int."
+            )
         n = len(self.table)
         index = index.astype(np.int64)
         if index.min() < -n or index.max() >= n:
-            raise IndexError(f"index {index.min() if index.min() < -n else index.max()} is out of range for {n} windows.")
+            raise IndexError(
+                f"index {index.min() if index.min() < -n else index.max()} is out of range for {n} windows."
+            )
         index %= n
         table = self.table
         rows: Mapping[str, Any]
@@ -157,13 +168,13 @@ class WindowDataset(Dataset[Batch]):
         return batch
 
     def __getitem__(self, index: int | Sequence[int]) -> Batch:
-        """Return one window, or a batch for a list of indices (a ``DataLoader`` with a batch sampler as `sampler`)."""
+        """Return one window, or a batch for a list of indices (from a batch sampler)."""
         if isinstance(index, int | np.integer):
             return {name: value[0] for name, value in self.batch([int(index)]).items()}
         return self.batch(index)
 
     def __getitems__(self, indices: Sequence[int]) -> list[Batch]:
-        """Return several windows as a list; ``DataLoader`` calls this instead of one ``__getitem__`` per window."""
+        """Return several windows as a list; ``DataLoader`` calls this once per batch."""
         batch = self.batch(indices)
         return [{name: value[i] for name, value in batch.items()} for i in range(len(indices))]
 
@@ -173,13 +184,21 @@ class WindowDataset(Dataset[Batch]):
         Returns
         -------
         dict
-            ``sequence``, ``episode``, ``step`` (of the first row), ``rows`` (without padding), ``shard`` and ``row`` in it.
+            ``sequence``, ``episode``, ``step`` (of the first row), ``rows`` (without padding), ``shard`` and
+            ``row`` in it.
         """
         n = len(self.table)
         if not -n <= index < n:
             raise IndexError(f"index {index} is out of range for {n} windows.")
         t = self.table
-        names = {"sequence": t.sequence, "episode": t.episode, "step": t.step, "rows": t.count, "shard": t.shard, "row": t.start}
+        names = {
+            "sequence": t.sequence,
+            "episode": t.episode,
+            "step": t.step,
+            "rows": t.count,
+            "shard": t.shard,
+            "row": t.start,
+        }
         return {name: int(values[index]) for name, values in names.items()}
 
     def close(self) -> None:

@@ -7,6 +7,7 @@ import os
 import platform
 import shutil
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,26 @@ import numpy as np
 import numpy.typing as npt
 
 from navrep_data._version import __version__
-from navrep_data.errors import ConfigError, CorruptDataError, DatasetError, DatasetNotFoundError, FolderInUseError
+from navrep_data.errors import (
+    ConfigError,
+    CorruptDataError,
+    DatasetError,
+    DatasetNotFoundError,
+    FolderInUseError,
+)
 from navrep_data.io import sha256_file
 from navrep_data.observations import scan_to_rings
-from navrep_data.schema import ACTION_SIZE, COLUMNS, DT, N_RAYS, RANGE_MAX, ROBOT_STATE_SIZE, Event, SensorContract
-from navrep_data.shards import Manifest, ShardWriter, dataset_card, publish
+from navrep_data.schema import (
+    ACTION_SIZE,
+    COLUMNS,
+    DT,
+    N_RAYS,
+    RANGE_MAX,
+    ROBOT_STATE_SIZE,
+    Event,
+    SensorContract,
+)
+from navrep_data.shards import Manifest, ShardEntry, ShardWriter, dataset_card, publish
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -36,8 +52,9 @@ COLLISION_REWARD = -25.0
 # The original's clock passes 35 s on the 176th step (accumulated 0.2 s in floating point).
 TIMEOUT_ROWS = 176
 
-_FLOATS = frozenset({np.dtype("f4"), np.dtype("f8")})
-_EXPECTED: dict[str, tuple[tuple[int, ...], frozenset[np.dtype[Any]]]] = {
+Dtypes = frozenset[np.dtype[Any]]
+_FLOATS: Dtypes = frozenset({np.dtype("f4"), np.dtype("f8")})
+_EXPECTED: dict[str, tuple[tuple[int, ...], Dtypes]] = {
     "scans": ((N_RAYS,), frozenset({np.dtype("f4")})),
     "robotstates": ((ROBOT_STATE_SIZE,), _FLOATS),
     "actions": ((ACTION_SIZE,), _FLOATS),
@@ -48,13 +65,14 @@ _COLUMNS = tuple(name for name in COLUMNS if name != "humans")
 
 
 def _array(archive: zipfile.ZipFile, name: str, path: Path, read: bool) -> tuple[int, npt.NDArray[Any] | None]:
-    """Return the number of rows of one array, and its content if `read`; nothing is unpickled or read beyond its shape."""
+    """Return the number of rows of one array, and its content if `read`; nothing is ever unpickled."""
     shape, dtypes = _EXPECTED[name]
     try:
         info = archive.getinfo(f"{name}.npy")
     except KeyError:
         raise CorruptDataError(
-            f"{path} has no array {name!r} (it has: {', '.join(archive.namelist()[:8])}); expected {', '.join(_EXPECTED)}."
+            f"{path} has no array {name!r} (it has: {', '.join(archive.namelist()[:8])}); "
+            f"expected {', '.join(_EXPECTED)}."
         ) from None
     with archive.open(info) as handle:
         version = np.lib.format.read_magic(handle)
@@ -62,7 +80,9 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path, read: bool) -> tuple
             raise CorruptDataError(f"{path}: array {name!r} has npy version {version}, expected (1, 0).")
         seen, fortran, dtype = np.lib.format.read_array_header_1_0(handle, max_header_size=MAX_HEADER)
         if dtype.hasobject:
-            raise CorruptDataError(f"{path}: array {name!r} holds pickled objects, which are never loaded; expected plain numbers.")
+            raise CorruptDataError(
+                f"{path}: array {name!r} holds pickled objects, which are never loaded; expected numbers."
+            )
         if len(seen) != 1 + len(shape) or seen[1:] != shape or dtype not in dtypes or fortran:
             wanted = " or ".join(sorted(str(d) for d in dtypes))
             raise CorruptDataError(f"{path}: array {name!r} is {dtype} {seen}, expected {wanted} {('rows', *shape)}.")
@@ -70,12 +90,16 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path, read: bool) -> tuple
             raise DatasetError(f"{path}: array {name!r} has {seen[0]:,} rows, expected 1 to {MAX_ROWS:,} per file.")
         size = math.prod(seen) * dtype.itemsize
         if not 0 < info.file_size - size <= MAX_HEADER:
-            raise CorruptDataError(f"{path}: array {name!r} has {info.file_size:,} bytes, expected {size:,} and a header.")
+            raise CorruptDataError(
+                f"{path}: array {name!r} has {info.file_size:,} bytes, expected {size:,} and a header."
+            )
         if not read:
             return seen[0], None
         data = handle.read(size)
         if len(data) != size:
-            raise CorruptDataError(f"{path}: array {name!r} ends after {len(data):,} of {size:,} bytes. Get the file again.")
+            raise CorruptDataError(
+                f"{path}: array {name!r} ends after {len(data):,} of {size:,} bytes. Get the file again."
+            )
         handle.read(1)  # reaching the end makes zipfile check the CRC
         return seen[0], np.frombuffer(data, dtype).reshape(seen)
 
@@ -87,10 +111,14 @@ def _load(path: Path, read: bool = True) -> tuple[int, Arrays]:
             found = {name: _array(archive, name, path, read) for name in _EXPECTED}
     except DatasetError:
         raise
-    except (zipfile.BadZipFile, ValueError, EOFError, NotImplementedError, zipfile.zlib.error) as error:  # type: ignore[attr-defined]
-        raise CorruptDataError(f"{path} cannot be read as npz ({error}). Expected a file of the original software; get it again.") from error
+    except (zipfile.BadZipFile, ValueError, EOFError, NotImplementedError, zlib.error) as error:
+        raise CorruptDataError(
+            f"{path} cannot be read as npz ({error}). Expected a file of the original software; get it again."
+        ) from error
     except RuntimeError as error:  # what zipfile raises for an encrypted member
-        raise CorruptDataError(f"{path} cannot be read as npz ({error}). Expected a file of the original software.") from error
+        raise CorruptDataError(
+            f"{path} cannot be read as npz ({error}). Expected a file of the original software."
+        ) from error
     rows = {count for count, _ in found.values()}
     if len(rows) != 1:
         counts = ", ".join(f"{name} {count}" for name, (count, _) in found.items())
@@ -131,7 +159,8 @@ def align(arrays: Arrays, sequence: int) -> Arrays:
     Parameters
     ----------
     arrays : dict
-        ``robotstates`` (N, 5), ``actions`` (N, 3), ``rewards`` (N,), ``dones`` (N,) as the original stores them.
+        ``robotstates`` (N, 5), ``actions`` (N, 3), ``rewards`` (N,), ``dones`` (N,) as the original stores
+        them.
     sequence : int
         Index of the sequence in the dataset.
 
@@ -146,7 +175,8 @@ def align(arrays: Arrays, sequence: int) -> Arrays:
     """
     actions, rewards, dones = arrays["actions"], arrays["rewards"], arrays["dones"]
     n = len(dones)
-    # A frame of an episode that was never played stands where the robot was stuck; the row before it is the real end.
+    # A frame of an episode that was never played stands where the robot was stuck; the row before it is the
+    # real end.
     unplayed = dones & (actions == 0).all(1) & (rewards == 0)
     ended = dones.copy()
     ended[-1] = True
@@ -217,8 +247,8 @@ def import_npz(
     Parameters
     ----------
     source : path-like or iterable of path-like
-        Folder of ``NNN_scans_robotstates_actions_rewards_dones.npz`` files, one such file, or several. Each becomes a
-        sequence, in the order given (folders: by name).
+        Folder of ``NNN_scans_robotstates_actions_rewards_dones.npz`` files, one such file, or several. Each
+        becomes a sequence, in the order given (folders: by name).
     out : path-like
         New dataset folder; must not exist, or be empty.
     env : str
@@ -250,28 +280,34 @@ def import_npz(
 
     Notes
     -----
-    Source: navrep/scripts/make_vae_dataset.py. A row of the original holds the action and reward that *led to* it and no
-    episode's first observation. Here ``action`` and ``reward`` of a row are those of the next row of its episode, and 0 on its
-    last row; the original's stay in ``leading_action`` and ``leading_reward``. Scans stay float32 in metres; NaN and negative
-    ranges become 0 (invalid), +inf becomes `range_max`. Poses, radii and humans are not in the source.
+    Source: navrep/scripts/make_vae_dataset.py. A row of the original holds the action and reward that *led
+    to* it and no episode's first observation. Here ``action`` and ``reward`` of a row are those of the next
+    row of its episode, and 0 on its last row; the original's stay in ``leading_action`` and
+    ``leading_reward``. Scans stay float32 in metres; NaN and negative ranges become 0 (invalid), +inf becomes
+    `range_max`. Poses, radii and humans are not in the source.
 
-    Where its robot is stuck, the original ends the episode with one frame of another episode that is never played (done, zero
-    action, zero reward). The row before becomes the last one of the played episode (``stuck``), the odd frame an episode of
-    one row (``cut``). So the original's ``dones`` are ``is_last & (event != stuck)``.
+    Where its robot is stuck, the original ends the episode with one frame of another episode that is never
+    played (done, zero action, zero reward). The row before becomes the last one of the played episode
+    (``stuck``), the odd frame an episode of one row (``cut``). So the original's ``dones`` are ``is_last &
+    (event != stuck)``.
 
-    Events follow from rewards: 100 goal, -25 ``collision_obstacle`` (the source does not tell humans from obstacles),
-    done on row 176 ``timeout``, anything else ``cut``.
+    Events follow from rewards: 100 goal, -25 ``collision_obstacle`` (the source does not tell humans from
+    obstacles), done on row 176 ``timeout``, anything else ``cut``.
     """
     out = Path(out)
     files = _find(source)
     if not (math.isfinite(range_max) and range_max > 0 and math.isfinite(dt) and dt > 0):
         raise ConfigError(f"range_max is {range_max} m and dt {dt} s, expected positive numbers.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FolderInUseError(f"{out} is in use, expected a new or empty folder: an import never overwrites. Choose another.")
+        raise FolderInUseError(
+            f"{out} is in use, expected a new or empty folder: an import never overwrites. Choose another."
+        )
     # Everything is made beside the target and renamed at the end, so `out` is either complete or as it was.
     part = out.with_name(out.name + ".part")
     if part.exists():
-        raise FolderInUseError(f"{part} exists, left by an import that was interrupted or still runs. Remove it if none runs.")
+        raise FolderInUseError(
+            f"{part} exists, left by an import that was interrupted or still runs. Remove it if none runs."
+        )
     lengths = [_load(path, read=False)[0] for path in files]
     manifest = _plan(files, lengths, env, SensorContract(range_max=float(range_max), dt=float(dt)), rings)
     try:
@@ -311,10 +347,15 @@ def _plan(files: Sequence[Path], lengths: Sequence[int], env: str, sensor: Senso
 
 
 def _write(
-    root: Path, manifest: Manifest, files: Sequence[Path], range_max: float, rings: bool, progress: Callable[[int, int], None] | None
+    root: Path,
+    manifest: Manifest,
+    files: Sequence[Path],
+    range_max: float,
+    rings: bool,
+    progress: Callable[[int, int], None] | None,
 ) -> Manifest:
     """Write all shards, the card and the manifest."""
-    shards = []
+    shards: list[ShardEntry] = []
     for first in range(0, len(files), manifest.shard_size):
         writer = ShardWriter(
             env=manifest.env,

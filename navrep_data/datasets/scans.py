@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from pathlib import Path
 
 from navrep_data.datasets._windows import (
     Batch,
@@ -27,7 +28,8 @@ class ScanDataset(WindowDataset):
     root : path-like
         Dataset folder.
     lidar : {"rings", "1d"}
-        ``rings``: field `rings`, (64, 64) float32, 0 free, 0.5 unknown, 1 occupied. ``1d``: field `scan`, (n_rays,) float32.
+        ``rings``: field `rings`, (64, 64) float32, 0 free, 0.5 unknown, 1 occupied. ``1d``: field `scan`,
+        (n_rays,) float32.
     split : {"train", "val", "test"} or None
         Part of the dataset, None for all.
     fields : iterable of str
@@ -45,7 +47,8 @@ class ScanDataset(WindowDataset):
     Notes
     -----
     Random frames from disk decode a whole chunk of rows for each; for many epochs use ``preload=True``, or
-    :class:`StreamingSequenceDataset` with ``window=1``. The original zeroes range bin 0 of rings before V; models do that.
+    :class:`StreamingSequenceDataset` with ``window=1``. The original zeroes range bin 0 of rings before V;
+    models do that.
     """
 
     def __init__(
@@ -59,7 +62,7 @@ class ScanDataset(WindowDataset):
         invalid: Invalid = "zero",
         preload: bool = False,
     ) -> None:
-        folder = DatasetFolder(root)
+        folder = DatasetFolder(Path(root))
         spec = make_spec(
             folder,
             window=1,

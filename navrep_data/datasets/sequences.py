@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Literal
 
 from navrep_data.datasets._batch import STEP_FIELDS
@@ -29,8 +30,9 @@ class SequenceDataset(WindowDataset):
     root : path-like
         Dataset folder, as written by ``navrep-data generate`` or :func:`import_npz`.
     lidar : {"rings", "1d"} or None
-        ``rings``: field `rings`, (W, 64, 64) float32, 0 free, 0.5 unknown, 1 occupied, computed from the stored scan where
-        the dataset has no rings. ``1d``: field `scan`, (W, n_rays) float32. None: no lidar field.
+        ``rings``: field `rings`, (W, 64, 64) float32, 0 free, 0.5 unknown, 1 occupied, computed from the
+        stored scan where the dataset has no rings. ``1d``: field `scan`, (W, n_rays) float32. None: no lidar
+        field.
     window : int
         W, rows per window.
     stride : int, optional
@@ -38,27 +40,31 @@ class SequenceDataset(WindowDataset):
     split : {"train", "val", "test"} or None
         Part of the dataset (by sequence), None for all.
     fields : iterable of str, optional
-        Fields besides the lidar's and `mask`. Default: ``robot_state`` (W, 5), ``action`` (W, 3), ``action_valid`` (W,) bool,
-        ``reward`` (W,), ``is_first``, ``is_last``, ``is_terminal`` (W,) bool, and for imports ``goal_valid`` (W,) bool.
-        On request: ``humans`` (W, H, 6) with NaN where there is nobody, ``robot_pose`` (W, 3) and ``robot_radius`` (W,)
-        (NaN in imports), ``event``, ``sequence``, ``episode``, ``step``, ``rings`` or ``scan`` beside the other lidar.
+        Fields besides the lidar's and `mask`. Default: ``robot_state`` (W, 5), ``action`` (W, 3),
+        ``action_valid`` (W,) bool, ``reward`` (W,), ``is_first``, ``is_last``, ``is_terminal`` (W,) bool, and
+        for imports ``goal_valid`` (W,) bool. On request: ``humans`` (W, H, 6) with NaN where there is nobody,
+        ``robot_pose`` (W, 3) and ``robot_radius`` (W,) (NaN in imports), ``event``, ``sequence``,
+        ``episode``, ``step``, ``rings`` or ``scan`` beside the other lidar.
     action : {"taken", "leading"}
-        ``taken``: the action chosen at a row; ``action_valid`` is False on the last row of an episode. ``leading``: the action
-        that led to a row, what the original's models are fed; zero and not ``action_valid`` at ``is_first``.
+        ``taken``: the action chosen at a row; ``action_valid`` is False on the last row of an episode.
+        ``leading``: the action that led to a row, what the original's models are fed; zero and not
+        ``action_valid`` at ``is_first``.
     targets : bool
-        Add ``next_*``, the row after each row, for the fields that are observed (lidar, ``robot_state``, ``goal_valid``,
-        ``humans``, ``robot_pose``), and ``next_mask``; see Notes.
+        Add ``next_*``, the row after each row, for the fields that are observed (lidar, ``robot_state``,
+        ``goal_valid``, ``humans``, ``robot_pose``), and ``next_mask``; see Notes.
     across_episodes : bool
         Cut windows by the original's rule; see Notes.
     scan_unit : {"metres", "normalized"}
-        Scans in metres, or divided by the sensor's range_max without clipping. Metres by default: that is what the word scan
-        means everywhere in this package, and the released models differ in what they divide by.
+        Scans in metres, or divided by the sensor's range_max without clipping. Metres by default: that is
+        what the word scan means everywhere in this package, and the released models differ in what they
+        divide by.
     invalid : {"zero", "range_max"}
-        What an invalid ray (stored as 0) becomes. Zero by default: it stays recognisable, rings ignore it, and so
-        ``scan_to_rings(scan)`` equals the stored rings; ``range_max`` suits models that would take 0 for a wall.
+        What an invalid ray (stored as 0) becomes. Zero by default: it stays recognisable, rings ignore it,
+        and so ``scan_to_rings(scan)`` equals the stored rings; ``range_max`` suits models that would take 0
+        for a wall.
     preload : bool
-        Decode everything once and hold it in memory as stored (2.2 kB per row for scans, 4.1 kB for rings). Forked workers
-        share it; spawned workers load their own.
+        Decode everything once and hold it in memory as stored (2.2 kB per row for scans, 4.1 kB for rings).
+        Forked workers share it; spawned workers load their own.
 
     Raises
     ------
@@ -71,23 +77,26 @@ class SequenceDataset(WindowDataset):
 
     Notes
     -----
-    Default rule: windows start at episode start + k * stride and never reach into another episode. Rows past the end of an
-    episode are zero and ``mask`` (W,) bool is False there. ``next_mask`` is False, and ``next_*`` zero, on the last
-    row of an episode, which has no successor; so a window that holds only that row has no target at all.
+    Default rule: windows start at episode start + k * stride and never reach into another episode. Rows past
+    the end of an episode are zero and ``mask`` (W,) bool is False there. ``next_mask`` is False, and
+    ``next_*`` zero, on the last row of an episode, which has no successor; so a window that holds only that
+    row has no target at all.
 
     ``across_episodes=True`` is the rule by which the original trains its joint model and transformer
-    (navrep/tools/wdataset.py): each sequence is cut at ``1 + k * stride`` into whole windows, whatever episodes lie in them,
-    and W + 1 rows are read (what is left at the end of a sequence is dropped; all masks are True). Where ``is_last`` holds
-    at row t, the frame of row t and the target frame ``next_*`` of row t are zero; states, goals and actions are not. The original
-    feeds its models only ``robot_state[..., :2]``, the goal; here the whole state is handed out and the model picks. Three
-    differences: the original cuts through all files put end to end; its rows lack the first observation of every episode, ours
-    have it (imports of its files lack it too); and where an import's robot was stuck, the last frame before it gave up is blanked
-    as well as the odd frame after it (see :func:`import_npz`).
+    (navrep/tools/wdataset.py): each sequence is cut at ``1 + k * stride`` into whole windows, whatever
+    episodes lie in them, and W + 1 rows are read (what is left at the end of a sequence is dropped; all masks
+    are True). Where ``is_last`` holds at row t, the frame of row t and the target frame ``next_*`` of row t
+    are zero; states, goals and actions are not. The original feeds its models only ``robot_state[..., :2]``,
+    the goal; here the whole state is handed out and the model picks. Three differences: the original cuts
+    through all files put end to end; its rows lack the first observation of every episode, ours have it
+    (imports of its files lack it too); and where an import's robot was stuck, the last frame before it gave
+    up is blanked as well as the odd frame after it (see :func:`import_npz`).
 
     No field of a default batch holds NaN: an unknown goal (imports) becomes 0 with ``goal_valid`` False.
 
-    Batches are faster than windows: ``DataLoader(dataset, batch_size=64)`` fetches them whole but stacks them once more;
-    ``DataLoader(dataset, sampler=BatchSampler(RandomSampler(dataset), 64, False), batch_size=None)`` does not.
+    Batches are faster than windows: ``DataLoader(dataset, batch_size=64)`` fetches them whole but stacks them
+    once more; ``DataLoader(dataset, sampler=BatchSampler(RandomSampler(dataset), 64, False),
+    batch_size=None)`` does not.
 
     Examples
     --------
@@ -116,7 +125,7 @@ class SequenceDataset(WindowDataset):
     ) -> None:
         window = check_rows("window", window)
         stride = window if stride is None else check_rows("stride", stride)
-        folder = DatasetFolder(root)
+        folder = DatasetFolder(Path(root))
         spec = make_spec(
             folder,
             window=window,

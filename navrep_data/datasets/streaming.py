@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -34,7 +35,7 @@ _CONVERT = 32
 
 
 def _rank_and_world(rank: int | None, world_size: int | None) -> tuple[int, int]:
-    """Return rank and number of ranks: as given, or from torch.distributed, or from the environment, or (0, 1)."""
+    """Return rank and number of ranks: given, or of torch.distributed, or of the environment, or (0, 1)."""
     if (rank is None) != (world_size is None):
         raise ConfigError(f"rank is {rank} and world_size is {world_size}, expected both or neither.")
     if rank is None or world_size is None:
@@ -43,7 +44,9 @@ def _rank_and_world(rank: int | None, world_size: int | None) -> tuple[int, int]
         else:
             given = os.environ.get("RANK", "0"), os.environ.get("WORLD_SIZE", "1")
             if not all(text.isdecimal() for text in given):
-                raise ConfigError(f"RANK is {given[0]!r} and WORLD_SIZE {given[1]!r} in the environment, expected numbers.")
+                raise ConfigError(
+                    f"RANK is {given[0]!r} and WORLD_SIZE {given[1]!r} in the environment, expected numbers."
+                )
             rank, world_size = int(given[0]), int(given[1])
     if not 0 <= rank < world_size:
         raise ConfigError(f"rank is {rank} of {world_size}, expected 0 <= rank < world_size.")
@@ -64,8 +67,8 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
     root, lidar, window, stride, split, fields, action, targets, across_episodes, scan_unit, invalid
         As in :class:`SequenceDataset`.
     batch_size : int, optional
-        Hand out batches of this many windows (the last one of an epoch may be smaller) instead of single windows; use
-        ``DataLoader(dataset, batch_size=None)`` then. Faster, as nothing is stacked twice.
+        Hand out batches of this many windows (the last one of an epoch may be smaller) instead of single
+        windows; use ``DataLoader(dataset, batch_size=None)`` then. Faster, as nothing is stacked twice.
     shuffle : bool
         Shuffle shards, the sequences in them, and windows within the buffer; else stored order.
     buffer_sequences : int
@@ -74,8 +77,8 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
     seed : int
         Order = f(seed, epoch, world_size, rank, worker).
     rank, world_size : int, optional
-        This process among those that share an epoch; by default from ``torch.distributed`` if initialised, else from the
-        environment (``RANK``, ``WORLD_SIZE``), else alone. Read once, here.
+        This process among those that share an epoch; by default from ``torch.distributed`` if initialised,
+        else from the environment (``RANK``, ``WORLD_SIZE``), else alone. Read once, here.
 
     Raises
     ------
@@ -86,14 +89,17 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
 
     Notes
     -----
-    One epoch: the shards are put in random order, the sequences within each too; that list of windows is cut into equal
-    parts, one per rank, and again one per DataLoader worker; each consumer walks through its part, `buffer_sequences` at a
-    time, windows shuffled within. So every window comes exactly once per epoch over all ranks and workers, parts differ by at most one
-    window, and each sequence is decoded once, or twice where a cut falls into it.
+    One epoch: the shards are put in random order, the sequences within each too; that list of windows is cut
+    into equal parts, one per rank, and again one per DataLoader worker; each consumer walks through its part,
+    `buffer_sequences` at a time, windows shuffled within. So every window comes exactly once per epoch over
+    all ranks and workers, parts differ by at most one window, and each sequence is decoded once, or twice
+    where a cut falls into it.
 
-    Call :meth:`set_epoch` before every epoch, or all epochs have the same order. It reaches persistent workers too.
+    Call :meth:`set_epoch` before every epoch, or all epochs have the same order. It reaches persistent
+    workers too.
 
-    Resume: :meth:`state_dict` and :meth:`load_state_dict`, exact to the window; see there for how with workers.
+    Resume: :meth:`state_dict` and :meth:`load_state_dict`, exact to the window; see there for how with
+    workers.
     """
 
     def __init__(
@@ -124,7 +130,7 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         self.shuffle = bool(shuffle)
         self.seed = int(seed)
         self.rank, self.world_size = _rank_and_world(rank, world_size)
-        self._folder = DatasetFolder(root)
+        self._folder = DatasetFolder(Path(root))
         self.spec = make_spec(
             self._folder,
             window=window,
@@ -142,8 +148,10 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         self._sequences = sequences_of(episodes)
         self._assemble = Assembler(self.spec)
         self._pool = BufferPool(keep=2 * len(self.spec.needed()))
-        # In shared memory, so that set_epoch in the main process reaches workers that live for several epochs.
-        self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()
+        # In shared memory, so that set_epoch in the main process reaches workers that live for several
+        # epochs.
+        self._epoch = torch.zeros(1, dtype=torch.int64)
+        self._epoch.share_memory_()  # type: ignore[no-untyped-call]
         self._resume: dict[str, Any] | None = None
         self._position = 0
         self._worker = (0, 1)
@@ -154,7 +162,7 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         return int(self._epoch[0])
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the order of the next epoch; forgets a position to resume from unless it is in this epoch."""
+        """Choose the order of the next epoch; forget a position to resume from if it is in another one."""
         self._epoch[0] = int(epoch)
         if self._resume is not None and self._resume["epoch"] != epoch:
             self._resume = None
@@ -173,7 +181,7 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
     # ---- order ----
 
     def _sequence_order(self, epoch: int) -> Ints:
-        """Return the positions in the sequence table in this epoch's order, the same on all ranks and workers."""
+        """Return the positions in the sequence table in this epoch's order, the same for all consumers."""
         shard = self._sequences.shard
         if not self.shuffle:
             return np.arange(len(shard))
@@ -220,8 +228,8 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         if resume is not None and resume["epoch"] == epoch:
             if resume["workers"] != workers:
                 raise ConfigError(
-                    f"The state to resume from was taken with {resume['workers']} consumers (DataLoader workers, 1 without), "
-                    f"this loader has {workers}. Use the same num_workers until the end of the epoch."
+                    f"The state to resume from is of {resume['workers']} consumers (DataLoader workers, "
+                    f"1 without), this loader has {workers}. Use the same num_workers until the epoch ends."
                 )
             # The new loader asks its worker 0 first; the old one would have asked another one next.
             worker = (worker + resume["next_worker"]) % workers
@@ -233,7 +241,7 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         self._position = 0
 
     def _batches(self, epoch: int, worker: int, workers: int, skip: int) -> Iterator[Batch]:
-        """Yield this consumer's windows after the first `skip`, in batches of any size up to ``batch_size``."""
+        """Yield this consumer's windows after the first `skip`, in batches of up to ``batch_size``."""
         size = self.batch_size or _CONVERT
         for sequences, windows in self._blocks(epoch, worker, workers):
             if skip >= len(windows):
@@ -243,8 +251,11 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
             loaded = self._take(sequences)
             for k in range(0, len(windows), size):
                 index = windows[k : k + size]
-                table = WindowTable(*(getattr(self.table, field.name)[index] for field in dataclasses.fields(self.table)))
+                table = WindowTable(
+                    *(getattr(self.table, field.name)[index] for field in dataclasses.fields(self.table))
+                )
                 yield self._assemble(loaded.rows, loaded.locate(table), table.count, table.after)
+            del loaded  # before the next block is decoded, so that it can have the memory
 
     def _take(self, positions: Ints) -> LoadedRows:
         positions = np.sort(positions)
@@ -253,7 +264,7 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         return LoadedRows(self._folder, self.spec.needed(), part, self._pool)
 
     def _hand_out(self, pieces: Iterator[Batch]) -> Iterator[Batch]:
-        """Yield single windows, or batches of exactly ``batch_size`` (the last may be smaller), counting them."""
+        """Yield single windows, or batches of ``batch_size`` (the last may be smaller), counting them."""
         pending: Batch | None = None
         for piece in pieces:
             if self.batch_size is None:
@@ -287,19 +298,23 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
             "world_size": self.world_size,
         }
 
-    def state_dict(self, batches: int | None = None, *, num_workers: int = 0, batch_size: int | None = None) -> dict[str, Any]:
+    def state_dict(
+        self, batches: int | None = None, *, num_workers: int = 0, batch_size: int | None = None
+    ) -> dict[str, Any]:
         """Return where in the epoch this rank is, as plain JSON values.
 
         Parameters
         ----------
         batches : int, optional
-            Batches received from the DataLoader since this epoch started (or was resumed). Needed with ``num_workers > 0``,
-            where only the workers' copies of this object move. None: ask this object, which is right when it is iterated
-            in this very process (``num_workers=0``), and inside a worker (torchdata's StatefulDataLoader calls it there).
+            Batches received from the DataLoader since this epoch started (or was resumed). Needed with
+            ``num_workers > 0``, where only the workers' copies of this object move. None: ask this object,
+            which is right when it is iterated in this very process (``num_workers=0``), and inside a worker
+            (torchdata's StatefulDataLoader calls it there).
         num_workers : int
             Of the DataLoader.
         batch_size : int, optional
-            Of the DataLoader, with ``drop_last=False`` and ``in_order=True``; by default this object's own ``batch_size``.
+            Of the DataLoader, with ``drop_last=False`` and ``in_order=True``; by default this object's own
+            ``batch_size``.
 
         Raises
         ------
@@ -318,10 +333,11 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         return {"version": 1, "epoch": self.epoch, **self._identity(), **state}
 
     def _count(self, batches: int, workers: int, batch_size: int | None) -> tuple[list[int], int]:
-        """Return the positions of all workers after `batches` batches of a DataLoader, and which one comes next."""
+        """Return the positions of all workers after `batches` batches, and which one comes next."""
         if batch_size is None or batches < 0:
             raise ConfigError(
-                f"batches is {batches} and batch_size {batch_size}, expected batches >= 0 and the DataLoader's batch_size."
+                f"batches is {batches} and batch_size {batch_size}, "
+                "expected batches >= 0 and the DataLoader's batch_size."
             )
         positions, worker = [0] * workers, 0
         if self._resume is not None and self._resume["workers"] == workers:
@@ -342,8 +358,8 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         Parameters
         ----------
         state : mapping
-            From :meth:`state_dict`. The rest of the epoch then has exactly the windows that had not been handed out,
-            in the order in which they would have come, given the same number of workers.
+            From :meth:`state_dict`. The rest of the epoch then has exactly the windows that had not been
+            handed out, in the order in which they would have come, given the same number of workers.
 
         Raises
         ------
@@ -359,7 +375,9 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
                 )
         positions, workers = state.get("positions"), state.get("workers")
         if not isinstance(positions, list) or len(positions) != workers:
-            raise ConfigError(f"The state to resume from has positions {positions!r}, expected one per worker ({workers}).")
+            raise ConfigError(
+                f"The state to resume from has positions {positions!r}, expected one per worker ({workers})."
+            )
         self._epoch[0] = int(state["epoch"])
         self._resume = {name: state[name] for name in ("epoch", "positions", "workers", "next_worker")}
         self._worker, self._position = (0, 1), 0

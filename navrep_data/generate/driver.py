@@ -251,8 +251,12 @@ class _Run:
         check_same(old, self.request, explicit_shard_size)
         if old.versions != versions():
             changed = [f"{k} {old.versions.get(k)} -> {v}" for k, v in versions().items() if old.versions.get(k) != v]
-            self.say(f"Note: made with other versions ({', '.join(changed)}); new shards may differ in their last digits.")
-        kept = tuple(e for k, e in enumerate(old.shards) if self._intact(e, hashed=k >= len(old.shards) - RECHECKED_SHARDS))
+            self.say(
+                f"Note: made with other versions ({', '.join(changed)}); new shards may differ in their last digits."
+            )
+        kept = tuple(
+            e for k, e in enumerate(old.shards) if self._intact(e, hashed=k >= len(old.shards) - RECHECKED_SHARDS)
+        )
         return replace(old, shards=kept, planned=self.request.n, command=self.request.command, complete=False)
 
     def _intact(self, entry: ShardEntry, *, hashed: bool) -> bool:
@@ -296,9 +300,14 @@ class _Run:
             self._save()
         executor = LocalExecutor(self.request.spec, workers)
         with tqdm(
-            total=self.request.rows, initial=done_rows, unit="rows", unit_scale=True, disable=not progress, smoothing=0.1,
+            total=self.request.rows,
+            initial=done_rows,
+            unit="rows",
+            unit_scale=True,
+            disable=not progress,
+            smoothing=0.1,
             dynamic_ncols=True,
-        ) as bar:  # fmt: skip
+        ) as bar:
             for finished in executor.run(tasks):
                 if finished is not None:
                     self._add(*finished)
@@ -329,7 +338,9 @@ class _Run:
             self._replace(task, entry)
         self._entries[task.first, task.stop] = entry
         self.new_rows += entry.rows
-        if task.staged or time.monotonic() - self._saved_at > max(MANIFEST_SECONDS, self._save_seconds / MANIFEST_SHARE):
+        if task.staged or time.monotonic() - self._saved_at > max(
+            MANIFEST_SECONDS, self._save_seconds / MANIFEST_SHARE
+        ):
             self._save()
 
     def _replace(self, task: ShardTask, entry: ShardEntry) -> None:
@@ -352,7 +363,9 @@ class _Run:
         entries: Iterable[ShardEntry] = self._entries.values()
         manifest = self.manifest.with_shards(entries, complete=True)
         if manifest.sequences != self.request.n:
-            raise DatasetError(f"{self.root} has {manifest.sequences} of {self.request.n} sequences; run the same command again.")
+            raise DatasetError(
+                f"{self.root} has {manifest.sequences} of {self.request.n} sequences; run the same command again."
+            )
         self.manifest = manifest.save(self.root, dataset_card(manifest))
         shutil.rmtree(self.root / STAGING, ignore_errors=True)
 

@@ -43,7 +43,7 @@ class LocalExecutor:
     @property
     def rows_made(self) -> int:
         """Rows simulated so far, those of unfinished shards included."""
-        return self._here + self._finished + sum(self._counters)
+        return self._here + self._finished + sum(int(rows) for rows in self._counters)
 
     def run(self, tasks: Sequence[ShardTask]) -> Iterator[Finished | None]:
         """Yield each finished task, and None several times a second while waiting."""
@@ -80,15 +80,19 @@ class LocalExecutor:
                 restarts = 0 if done else restarts + 1
                 if restarts > MAX_RESTARTS:
                     raise WorkerDiedError(
-                        f"Worker processes died {restarts} times before finishing shard {tasks[0].index} (killed, or out of "
-                        "memory?). What was finished is intact; run the same command again, perhaps with fewer --workers."
+                        f"Worker processes died {restarts} times before finishing shard {tasks[0].index} (killed, or "
+                        "out of memory?). What was finished is intact; run the same command again, "
+                        "perhaps with fewer --workers."
                     ) from None
                 for slot in range(len(self._counters)):
                     self._counters[slot] = 0
 
     def _run_once(self, tasks: Sequence[ShardTask]) -> Iterator[Finished | None]:
         pool = ProcessPoolExecutor(
-            self.workers, mp_context=get_context("spawn"), initializer=start_worker, initargs=(self.spec, self._counters)
+            self.workers,
+            mp_context=get_context("spawn"),
+            initializer=start_worker,
+            initargs=(self.spec, self._counters),
         )
         free = list(range(len(self._counters)))
         running: dict[Future[ShardEntry], ShardTask] = {}
@@ -112,8 +116,8 @@ class LocalExecutor:
             if self.spec.policy.function is None:
                 raise
             raise PolicyError(
-                f"The policy cannot be sent to worker processes ({error}). Expected a function or object of an importable "
-                "module; use workers=1 or give its name as module:function."
+                f"The policy cannot be sent to worker processes ({error}). Expected a function or object of an "
+                "importable module; use workers=1 or give its name as module:function."
             ) from error
         finally:
             pool.shutdown(wait=True, cancel_futures=True)

@@ -70,18 +70,22 @@ def check_count(name: str, value: Any, low: int, high: int) -> int:
     return value
 
 
-def check_settings(config: SimConfig, length: int, scan_dtype: str | None, rings: bool, humans: bool) -> RolloutSettings:
+def check_settings(
+    config: SimConfig, length: int, scan_dtype: str | None, rings: bool, humans: bool
+) -> RolloutSettings:
     """Return the settings of the rows; chooses float32 scans by itself where millimetres do not fit 16 bits."""
     far = config.sensor.range_max > UINT16_RANGE_LIMIT
     if scan_dtype not in (None, "uint16", "float32"):
         raise ConfigError(f"--scan-dtype is {scan_dtype!r}, expected uint16 (millimetres) or float32 (metres).")
     if far and scan_dtype == "uint16":
         raise ConfigError(
-            f"--scan-dtype uint16 holds ranges up to {UINT16_RANGE_LIMIT:g} m, but range_max is {config.sensor.range_max:g} m; "
-            "use float32."
+            f"--scan-dtype uint16 holds ranges up to {UINT16_RANGE_LIMIT:g} m, but range_max is "
+            f"{config.sensor.range_max:g} m; use float32."
         )
     chosen = scan_dtype or ("float32" if far else "uint16")
-    return RolloutSettings(check_count("length", length, 1, MAX_LENGTH), chosen, rings, humans and config.max_humans > 0)
+    return RolloutSettings(
+        check_count("length", length, 1, MAX_LENGTH), chosen, rings, humans and config.max_humans > 0
+    )
 
 
 def make_request(
@@ -101,8 +105,8 @@ def make_request(
         shard_size = min(largest, max(policy.batch, DEFAULT_SHARD_ROWS // settings.length, 1))
     elif check_count("shard-size", shard_size, 1, MAX_SEQUENCES) > largest:
         raise ConfigError(
-            f"--shard-size is {shard_size}, expected at most {largest} sequences of {settings.length} rows: a shard is built in "
-            f"memory and may take {MAX_SHARD_BYTES >> 20} MiB."
+            f"--shard-size is {shard_size}, expected at most {largest} sequences of {settings.length} rows: a shard is "
+            f"built in memory and may take {MAX_SHARD_BYTES >> 20} MiB."
         )
     return Request(spec, n, shard_size, command)
 
@@ -157,15 +161,17 @@ def check_folder(root: Path) -> None:
     except (FileExistsError, NotADirectoryError):
         raise FolderInUseError(f"{root} is or lies under a file, expected a folder; choose another --out.") from None
     except OSError as error:
-        raise FolderNotWritableError(f"Cannot make the folder {root}: {error.strerror}; choose another --out.") from error
+        raise FolderNotWritableError(
+            f"Cannot make the folder {root}: {error.strerror}; choose another --out."
+        ) from error
     if (root / MANIFEST_FILE).exists():
         return
     own = {LOCK_FILE, STAGING}
     other = sorted(p.name for p in root.iterdir() if p.name not in own and not p.name.endswith(PART_SUFFIX))
     if other:
         raise FolderInUseError(
-            f"{root} holds something else ({', '.join(other[:3])}{', ...' if len(other) > 3 else ''}) and no manifest.json; "
-            "expected an empty or new folder, or a dataset to go on with. Choose another --out."
+            f"{root} holds something else ({', '.join(other[:3])}{', ...' if len(other) > 3 else ''}) and no "
+            "manifest.json; expected an empty or new folder, or a dataset to go on with. Choose another --out."
         )
 
 

@@ -88,13 +88,15 @@ def load_callable(name: str) -> PolicyFunction:
             found = getattr(found, part)
     except (ImportError, AttributeError, ValueError) as error:
         raise PolicyError(
-            f"Policy {name!r} cannot be imported ({error}). Expected module:function, importable from {here}, or one of: "
-            f"{', '.join(SCRIPTED)}."
+            f"Policy {name!r} cannot be imported ({error}). Expected module:function, importable from {here}, or one "
+            f"of: {', '.join(SCRIPTED)}."
         ) from error
     if isinstance(found, type):
         found = found()
     if not callable(found):
-        raise PolicyError(f"Policy {name!r} is a {type(found).__name__}, expected a callable policy(scan, robot_state).")
+        raise PolicyError(
+            f"Policy {name!r} is a {type(found).__name__}, expected a callable (scan, robot_state)."
+        )
     return found  # type: ignore[no-any-return]
 
 

@@ -11,6 +11,7 @@ from navrep_data.io._files import (
     safe_join,
     sha256_bytes,
     sha256_file,
+    translate_os_error,
 )
 
 __all__ = [
@@ -24,4 +25,5 @@ __all__ = [
     "safe_join",
     "sha256_bytes",
     "sha256_file",
+    "translate_os_error",
 ]

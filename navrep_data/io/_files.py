@@ -144,7 +144,9 @@ def safe_join(root: Path, name: str) -> Path:
     """
     pure = PurePosixPath(name)
     if not name or pure.is_absolute() or ".." in pure.parts or "\\" in name or ":" in name or "\0" in name:
-        raise CorruptDataError(f"File name {name!r} points outside the dataset; expected a relative path inside {root}.")
+        raise CorruptDataError(
+            f"File name {name!r} points outside the dataset; expected a relative path inside {root}."
+        )
     return root.joinpath(*pure.parts)
 
 

@@ -12,7 +12,8 @@ one comparison with the bucket's edge decides the cell exactly.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from navrep_data._kernels import kernel
 
 N_SECTIONS = 64
 N_CELLS = 64
@@ -23,7 +24,7 @@ _BYTE = np.uint64(255)
 _ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _write_section(mask, behind, spread, row):
     """Write one section: `mask` marks returns, `behind` marks every cell from the nearest return outwards."""
     for group in range(8):
@@ -34,7 +35,7 @@ def _write_section(mask, behind, spread, row):
             row[8 * group + bit] = spread[low, bit] + spread[high, bit]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def rings_from_mm(scan, cell_of_mm, first_ray, spread, out):
     """Rings of one scan in millimetres.
 
@@ -54,7 +55,7 @@ def rings_from_mm(scan, cell_of_mm, first_ray, spread, out):
         _write_section(mask, behind, spread, out[section])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def rings_from_metres(scan, bits, cell_of_bucket, edge_bits, first_ray, spread, out):
     """Rings of one scan in metres.
 
@@ -86,21 +87,21 @@ def rings_from_metres(scan, bits, cell_of_bucket, edge_bits, first_ray, spread, 
         _write_section(mask, behind, spread, out[section])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def rings_from_mm_rows(scans, cell_of_mm, first_ray, spread, out):
     """`rings_from_mm` for scans (N, n_rays), out (N, 64, 64)."""
     for n in range(scans.shape[0]):
         rings_from_mm(scans[n], cell_of_mm, first_ray, spread, out[n])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def rings_from_metres_rows(scans, bits, cell_of_bucket, edge_bits, first_ray, spread, out):
     """`rings_from_metres` for scans (N, n_rays), out (N, 64, 64)."""
     for n in range(scans.shape[0]):
         rings_from_metres(scans[n], bits[n], cell_of_bucket, edge_bits, first_ray, spread, out[n])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def millimetres_row(scan, range_max, out):
     """Round one scan to millimetres: scan (n,) float32 [m], range_max [m], out (n,) uint16, overwritten.
 

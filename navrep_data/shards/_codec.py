@@ -3,10 +3,11 @@
 Notes
 -----
 The bytes are what HDF5's own filters 2 (shuffle) and 1 (deflate) accept, so that any HDF5 library reads them.
-Three things differ from what HDF5 would write itself: isal compresses about ten times faster than zlib; the
-byte planes of large chunks are separated by a flush, which gives each plane its own Huffman code (the low
-byte of a scan is nearly noise, the high byte nearly constant: 3 % smaller); and reading needs neither the
-HDF5 library nor its global lock.
+Three things differ from what HDF5 would write itself. isal compresses about five times faster than zlib. Byte
+planes of large chunks that are nearly noise (the low byte of a scan in millimetres) go into the stream as
+deflate's uncompressed blocks: measured on the original's scans, 1.30 instead of 1.22 kB/row, but random
+windows are read 2.3 times faster (7.7k/s against 3.3k/s) and written in half the time; the other planes have
+Huffman codes of their own. And reading needs neither the HDF5 library nor its global lock.
 """
 
 from __future__ import annotations
@@ -19,7 +20,11 @@ from isal import isal_zlib
 
 DEFLATE_LEVEL = 2
 # Below this size a Huffman table per plane costs more than it saves.
-SPLIT_PLANE_BYTES = 16384
+SPLIT_PLANE_BYTES = 8192
+# A plane is stored as it is where an eighth from its middle deflates to no less than this.
+_NOISE_RATIO = 0.85
+_ZLIB_HEADER = b"\x78\x01"
+_STORED_BLOCK_MAX = 0xFFFF
 # The stub calls it an instance; it is a class.
 _DAMAGED: Any = isal_zlib.error
 
@@ -49,12 +54,34 @@ def encode(block: npt.NDArray[Any]) -> bytes:
     planes = _planes(block)
     if planes.shape[1] < SPLIT_PLANE_BYTES:
         return bytes(isal_zlib.compress(planes, DEFLATE_LEVEL))
-    stream = isal_zlib.compressobj(DEFLATE_LEVEL)
-    parts = []
+    parts = [_ZLIB_HEADER]
     for plane in planes[:-1]:
-        parts += [stream.compress(plane), stream.flush(isal_zlib.Z_SYNC_FLUSH)]
-    parts += [stream.compress(planes[-1]), stream.flush()]
+        parts += _stored_blocks(plane) if _is_noise(plane) else _open_blocks(plane)
+    parts.append(isal_zlib.compress(planes[-1], DEFLATE_LEVEL, -isal_zlib.MAX_WBITS))
+    parts.append(int(isal_zlib.adler32(planes)).to_bytes(4, "big"))
     return b"".join(parts)
+
+
+def _is_noise(plane: npt.NDArray[np.uint8]) -> bool:
+    """Return whether deflating `plane` would save little, judged by a sample from its middle."""
+    sample = plane[plane.size * 7 // 16 : plane.size * 9 // 16]
+    return len(isal_zlib.compress(sample, DEFLATE_LEVEL)) > _NOISE_RATIO * sample.size
+
+
+def _stored_blocks(plane: npt.NDArray[np.uint8]) -> list[bytes]:
+    """Return `plane` as deflate blocks without compression (RFC 1951, 3.2.4), none of them the last."""
+    parts = []
+    for start in range(0, plane.size, _STORED_BLOCK_MAX):
+        block = plane[start : start + _STORED_BLOCK_MAX].tobytes()
+        size = len(block)
+        parts += [b"\0", size.to_bytes(2, "little"), (size ^ 0xFFFF).to_bytes(2, "little"), block]
+    return parts
+
+
+def _open_blocks(plane: npt.NDArray[np.uint8]) -> list[bytes]:
+    """Return `plane` deflated, ending on a byte and without a last block, so that more can follow."""
+    stream = isal_zlib.compressobj(DEFLATE_LEVEL, isal_zlib.DEFLATED, -isal_zlib.MAX_WBITS)
+    return [stream.compress(plane), stream.flush(isal_zlib.Z_SYNC_FLUSH)]
 
 
 def inflate(data: bytes, size: int) -> bytes:

@@ -30,19 +30,19 @@ NARROW_CHUNK_MAX = 4096
 VECTOR_COLUMNS = ("robot_state", "action", "robot_pose", "leading_action", "humans")
 """Columns whose last axis holds different quantities: their statistics are lists, one entry per component."""
 
-# Measured: scan, rings on the original's sequences at 20 rows per chunk; humans for 17.5 humans per row in 30
-# slots, of which only the filled ones cost; the rest on synthetic episodes. Index and padding are in EXTRA.
+# Measured at 20 rows per chunk: scan and rings on one of the original's sequences; humans (17.5 of 30 slots
+# filled) and the rest on synthetic episodes. _BYTES_EXTRA is a guess for chunk index, headers and worlds.
 BYTES_PER_ROW: dict[str, float] = {
-    "scan": 1220.0,
+    "scan": 1305.0,
     "rings": 290.0,
-    "robot_state": 15.5,
-    "action": 8.5,
-    "reward": 3.5,
-    "robot_pose": 7.5,
+    "robot_state": 16.7,
+    "action": 8.7,
+    "reward": 3.7,
+    "robot_pose": 7.6,
     "leading_action": 8.5,
     "leading_reward": 3.5,
 }
-_BYTES_PER_FLOAT32_RAY = 3.05
+_BYTES_PER_FLOAT32_RAY = 2.55
 _BYTES_PER_HUMAN_SLOT = 11.5
 _BYTES_OTHER_COLUMN = 0.3
 _BYTES_EXTRA = 20.0
@@ -83,9 +83,9 @@ def chunk_rows(length: int) -> int:
 
     Notes
     -----
-    A random 32-row window decodes 32 + chunk - 1 rows on average. Measured on the original's scans, uint16:
-    16 rows 1.24 kB/row, 20 rows 1.22, 25 rows 1.21, 40 rows 1.19; at 20 a window decodes 51 rows instead of
-    71.
+    A random 32-row window decodes 32 + chunk - 1 rows on average. Measured on one of the original's
+    sequences, uint16, one core of a busy machine, decoding alone: 10 rows 1.308 kB/row and 6.0k windows/s,
+    20 rows 1.303 and 7.7k, 40 rows 1.300 and 6.5k.
     """
     low, high = CHUNK_RANGE
     divisors = [d for d in range(low, high + 1) if length % d == 0]

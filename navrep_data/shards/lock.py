@@ -9,7 +9,7 @@ from pathlib import Path
 import filelock
 
 from navrep_data.errors import DatasetLockedError
-from navrep_data.io._files import translate_os_error
+from navrep_data.io import translate_os_error
 
 LOCK_FILE = ".navrep-data.lock"
 

@@ -19,8 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from navrep_data.errors import ConfigError, CorruptDataError
-from navrep_data.io import atomic_write_bytes, sha256_bytes
-from navrep_data.io._files import translate_os_error
+from navrep_data.io import atomic_write_bytes, sha256_bytes, translate_os_error
 from navrep_data.schema import COLUMNS, EVENT_NAMES, FORMAT_NAME, FORMAT_VERSION, Event, SensorContract
 from navrep_data.shards._codec import DEFLATE_LEVEL, encode
 from navrep_data.shards._layout import Layout, column_attributes, layouts, little_endian
@@ -136,7 +135,7 @@ def check_index(columns: Columns, sequence: int) -> str:
 
 
 def check_finite(name: str, array: npt.NDArray[Any]) -> str:
-    """Return what is wrong with the floats of a column, or an empty string: infinity, or NaN where none belongs."""
+    """Return what is wrong with the floats of a column (infinity, misplaced NaN), or an empty string."""
     if array.dtype.kind != "f" or np.isfinite(array).all():
         return ""
     if COLUMNS[name].may_be_nan and not np.isinf(array).any():

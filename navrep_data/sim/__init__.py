@@ -3,7 +3,13 @@
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
 from navrep_data.sim.registry import describe_environment, environment_names, make_config
-from navrep_data.sim.rollout import CallableRollout, PolicyFunction, RolloutSettings, ScriptedRollout, SequenceRows
+from navrep_data.sim.rollout import (
+    CallableRollout,
+    PolicyFunction,
+    RolloutSettings,
+    ScriptedRollout,
+    SequenceRows,
+)
 from navrep_data.sim.simulator import Simulator, WorldState, check_seed, warm_up
 
 __all__ = [

@@ -1,14 +1,15 @@
+# mypy: allow-untyped-defs, allow-untyped-decorators, no-check-untyped-defs
 """Batches of worlds, stepped together for callers outside the generator: every array has a leading world axis."""
 
 import numpy as np
-from numba import njit
 
+from navrep_data._kernels import kernel
 from navrep_data.sim._layout import S_EPISODE
 from navrep_data.sim._rng import seed_philox
 from navrep_data.sim._step import observe_scan, observe_state, reset_world, step_world
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def seed_worlds(rng, scalars, seed, first_sequence):
     """Give world w the stream of sequence first_sequence + w and forget all episodes."""
     for w in range(rng.shape[0]):
@@ -17,7 +18,7 @@ def seed_worlds(rng, scalars, seed, first_sequence):
         scalars[w, S_EPISODE] = -1.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def reset_worlds(
     mask, agents, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags
 ):  # fmt: skip
@@ -31,7 +32,7 @@ def reset_worlds(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def step_worlds(
     actions, agents, agents32, scalars, edges, polygon_start, obst_f, obst_i, params, orca_params, work_f, work_i,
     moves, rewards, events,
@@ -47,7 +48,7 @@ def step_worlds(
         events[w] = np.uint8(result[1])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def observe_worlds(
     agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, scans, states
 ):  # fmt: skip

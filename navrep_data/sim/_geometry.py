@@ -1,10 +1,12 @@
+# mypy: allow-untyped-defs, allow-untyped-decorators, no-check-untyped-defs
 """Distances between moving points and polygon edges: the one geometry that collisions are tested on."""
 
 import numpy as np
-from numba import njit
+
+from navrep_data._kernels import kernel
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def point_segment_sq(px, py, ax, ay, bx, by):
     """Return the squared distance of a point to the segment a-b (which may be a point)."""
     dx = bx - ax
@@ -19,7 +21,7 @@ def point_segment_sq(px, py, ax, ay, bx, by):
     return ex * ex + ey * ey
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _crosses(ax, ay, bx, by, cx, cy, dx, dy):
     """Return whether segments a-b and c-d properly intersect."""
     d1 = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
@@ -29,7 +31,7 @@ def _crosses(ax, ay, bx, by, cx, cy, dx, dy):
     return d1 * d2 < 0.0 and d3 * d4 < 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def in_solid(x, y, edges, polygon_start, n_polygons):
     """Return whether a point lies in solid matter: inside an anticlockwise polygon or outside a clockwise one."""
     for p in range(n_polygons):
@@ -45,7 +47,7 @@ def in_solid(x, y, edges, polygon_start, n_polygons):
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def swept_clearance(x0, y0, x1, y1, edges, polygon_start, n_polygons):
     """Return the smallest distance of a point moving from 0 to 1 to solid matter [m]; negative if it starts inside.
 
@@ -79,7 +81,7 @@ def swept_clearance(x0, y0, x1, y1, edges, polygon_start, n_polygons):
     return best
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def box_distance(px, py, cx, cy, hx, hy):
     """Return the distance of a point to an axis-aligned box with centre c and half sides h; 0 inside [m]."""
     gx = max(abs(px - cx) - hx, 0.0)

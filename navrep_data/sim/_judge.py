@@ -1,3 +1,4 @@
+# mypy: allow-untyped-defs, allow-untyped-decorators, no-check-untyped-defs
 """What a step of the robot leads to: clearances, reward, event, in the `consistent` physics.
 
 Reward is the paper's equation, all terms summed: 100 at the goal, -25 on collision, -1 within 0.2 m of an obstacle or
@@ -5,8 +6,8 @@ human, and the progress towards the goal in metres (paper, "Learning-based Navig
 """
 
 import numpy as np
-from numba import njit
 
+from navrep_data._kernels import kernel
 from navrep_data.schema import Event
 from navrep_data.sim._geometry import point_segment_sq, swept_clearance
 from navrep_data.sim._layout import (
@@ -38,7 +39,7 @@ STUCK = int(Event.STUCK)
 CUT = int(Event.CUT)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def human_clearance(agents, n_humans, moves, dt):
     """Return the smallest gap between the robot's disc and a human's while all move straight for dt [m].
 
@@ -56,7 +57,7 @@ def human_clearance(agents, n_humans, moves, dt):
     return best
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def judge(agents, scalars, edges, polygon_start, moves, params, result):
     """Fill result with (reward, event) of the step that `moves` describes, before anybody has moved.
 

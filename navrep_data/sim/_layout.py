@@ -82,7 +82,7 @@ POLICY_CONSTANT_VELOCITY = 3
 
 # --- random streams ------------------------------------------------------------------------------------------------
 RNG_WORDS = 632
-"""uint64 words per stream: the 624 words of a Mersenne Twister and its position, or a Philox key, counter and buffer."""
+"""uint64 words per stream: a Mersenne Twister's 624 and its position, or a Philox key, counter and buffer."""
 
 MAX_OBSTACLE_EDGES = 512
 """Room for the edges of a world after RVO2's tree has split them; worlds that need more are drawn again."""

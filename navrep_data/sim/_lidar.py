@@ -19,7 +19,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from navrep_data._kernels import kernel
 
 # Columns of `circles`.
 CIRCLE_X, CIRCLE_Y, CIRCLE_RADIUS, CIRCLE_OWNER = 0, 1, 2, 3
@@ -46,7 +47,7 @@ _ASIN_CUBIC = 0.5 * math.pi - 1.0
 _TURN = 2.0 * math.pi
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def bearing(y, x):
     """Return atan2(y, x) within 3e-7 rad, 0 at the origin; a minimax polynomial."""
     ax, ay = abs(x), abs(y)
@@ -74,7 +75,7 @@ def bearing(y, x):
     return -angle if y < 0.0 else angle
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _raise_line(inverse, cosines, sines, a, b):
     """Raise `inverse` to ``a * cosines + b * sines`` where that is larger; three views of equal length."""
     for i in range(inverse.shape[0]):
@@ -83,7 +84,7 @@ def _raise_line(inverse, cosines, sines, a, b):
         inverse[i] = value if value > old else old
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _draw_edge(directions, inverse, ax, ay, bx, by, ua, ub, per_turn, margin, slope_c, slope_s):
     """Draw the edge from a anticlockwise to b (robot frame); ua, ub: their bearings in rays, in one turn."""
     last = inverse.shape[0] - 1
@@ -115,14 +116,14 @@ def _draw_edge(directions, inverse, ax, ay, bx, by, ua, ub, per_turn, margin, sl
         ub += per_turn
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _edge_on(ax, ay, bx, by, det):
     """Return whether the line through a and b, det = cross(a, b), passes through the sensor at the origin."""
     ex, ey = bx - ax, by - ay
     return det * det <= EDGE_ON * EDGE_ON * (ex * ex + ey * ey)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _hidden_side(edges, first, stop, x, y):
     """Return the sign of cross(a, b) of the edges that cannot be the nearest hit, 0 where both sides may be.
 
@@ -150,7 +151,7 @@ def _hidden_side(edges, first, stop, x, y):
     return 1.0 if (area2 > 0.0) != inside else -1.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _draw_polygons(
     edges, poly_start, n_polys, x, y, ct, st, directions, inverse, per_radian, zero, per_turn, margin
 ):  # fmt: skip
@@ -187,7 +188,7 @@ def _draw_polygons(
                 _draw_edge(directions, inverse, bx, by, ax, ay, ub, ua, per_turn, margin, slope_c, slope_s)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _take_ray(inverse, owner_of_ray, hits, ray, value, owner):
     """Give a ray to `owner`, counting for all owners how many rays they have."""
     before = owner_of_ray[ray]
@@ -198,7 +199,7 @@ def _take_ray(inverse, owner_of_ray, hits, ray, value, owner):
     inverse[ray] = value
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _draw_circle(
     cx, cy, radius, power, owner, directions, inverse, owner_of_ray, hits, low_u, high_u, per_turn, gap_quirk
 ):  # fmt: skip
@@ -230,7 +231,7 @@ def _draw_circle(
         high_u += per_turn
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _draw_circles(
     circles, n_circles, x, y, ct, st, directions, inverse, owner_of_ray, hits, per_radian, zero, per_turn,
     margin, gap_quirk,
@@ -261,7 +262,7 @@ def _draw_circles(
         )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _finish(inverse, range_max, out):
     """Turn inverse ranges into ranges."""
     for ray in range(out.shape[0]):
@@ -269,7 +270,7 @@ def _finish(inverse, range_max, out):
         out[ray] = np.float32(value if value < range_max else range_max)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def scan_world(
     edges, poly_start, n_polys, circles, n_circles, x, y, theta, directions, angle_min, angle_increment,
     range_max, gap_quirk, inverse, owner_of_ray, hits, out,
@@ -309,7 +310,7 @@ def scan_world(
     _finish(inverse, range_max, out)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def scan_poses(
     edges, poly_start, circles, poses, directions, angle_min, angle_increment, range_max, gap_quirk, out
 ):
@@ -325,7 +326,7 @@ def scan_poses(
         )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def leg_circles(x, y, heading, speed, gait_x, gait_y, gait_theta, owner, rows):
     """Write the two legs of a walking human.
 

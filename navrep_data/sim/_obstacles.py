@@ -1,17 +1,20 @@
+# mypy: allow-untyped-defs, allow-untyped-decorators, no-check-untyped-defs
 """Static obstacles as RVO2 sees them: linked edges, convexity, and the edges' splitting by the obstacle tree.
 
-An obstacle is an edge that starts at a vertex; anticlockwise polygons are solid inside, clockwise ones bound free space.
-RVO2 sorts the edges into a binary space partition and cuts every edge that crosses the line of a chosen one. The cuts
-change what an agent sees (a half edge has its own nearest point and its own velocity obstacle), so they are part of the
-result and not only of the search; the tree itself is needed only to order edges at equal distance.
+An obstacle is an edge that starts at a vertex; anticlockwise polygons are solid inside, clockwise ones bound
+free space. RVO2 sorts the edges into a binary space partition and cuts every edge that crosses the line of a
+chosen one. The cuts change what an agent sees (a half edge has its own nearest point and its own velocity
+obstacle), so they are part of the result and not only of the search; the tree itself is needed only to order
+edges at equal distance.
 
 One column per edge, one row per field, so that the scan over all edges runs on vectors.
 """
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-# --- obst_f (OF_FIELDS, capacity) float32 ---------------------------------------------------------------------------
+# --- obst_f (OF_FIELDS, capacity) float32 -------------------------------------------------------------------
 OF_X = 0  # start of the edge [m]
 OF_Y = 1
 OF_X2 = 2  # its end: start of the next edge
@@ -23,16 +26,17 @@ OF_DX = 7  # unit direction of the edge before it was split
 OF_DY = 8
 OF_FIELDS = 9
 
-# --- obst_i (OI_FIELDS, capacity) int32 -----------------------------------------------------------------------------
+# --- obst_i (OI_FIELDS, capacity) int32 ---------------------------------------------------------------------
 OI_NEXT = 0
 OI_PREV = 1
 OI_CONVEX = 2
 OI_PARENT = 3  # node of the tree = index of its edge; -1 for the root
 OI_DEPTH = 4
 OI_SIDE = 5  # LEFT or RIGHT child of the parent
-OI_TIE = 6  # who comes first of this edge and the next at equal distance: TIE_* or the deciding node, see _tie_code
+OI_TIE = 6  # which of this edge and the next comes first at equal distance, see _tie_code
 OI_SHORT = 7  # 1 in column 0 where the world has an edge so short that its side of the world is ill defined
-# Scratch of build_obstacles; the list of pending edges and its copy use the two rows above, which are filled last.
+# Scratch of build_obstacles; the list of pending edges and its copy use the two rows above, which are filled
+# last.
 _LIST = OI_TIE
 _COPY = OI_SHORT
 _BEGIN = 8  # stack of pending lists: where each starts, the node above it, on which side of it
@@ -47,12 +51,12 @@ TIE_THIS_FIRST = -1
 TIE_NEXT_FIRST = -2
 
 RVO_EPSILON = np.float32(0.00001)
-# Sides are decided by cross products to within RVO_EPSILON: off by 1e-5 / length metres. Below this length that is
-# more than the margin inside which orca_velocity asks the tree (see NEAR_RANGE there).
+# Sides are decided by cross products to within RVO_EPSILON: off by 1e-5 / length metres. Below this length
+# that is more than the margin inside which orca_velocity asks the tree (see NEAR_RANGE there).
 SHORT_EDGE_SQ = np.float32(0.01**2)
 
 
-def make_obstacles(capacity):
+def make_obstacles(capacity: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Return empty ``(obst_f, obst_i)`` with room for `capacity` edges after splitting."""
     return np.zeros((OF_FIELDS, capacity), np.float32), np.zeros((OI_FIELDS, capacity), np.int32)
 
@@ -105,7 +109,7 @@ def _add_polygons(vertices, polygon_start, obst_f, obst_i):
 
 @njit(cache=True, error_model="numpy")
 def _best_split(begin, m, obst_f, obst_i):
-    """Return (position in the list, left size, right size) of the edge whose line parts the others most evenly."""
+    """Return (position, left size, right size) of the edge whose line parts the list most evenly."""
     best = 0
     best_left = m
     best_right = m
@@ -174,7 +178,7 @@ def _split(i, j, new, obst_f, obst_i):
 
 @njit(cache=True, error_model="numpy")
 def _partition(i, best, m, begin, n_left, n_right, n, obst_f, obst_i):
-    """Replace the list at `begin` by its right part and, behind it, its left part; return the new number of edges."""
+    """Replace a list by its right part and, behind it, its left part; return the number of edges."""
     for b in range(m):
         obst_i[_COPY, b] = obst_i[_LIST, begin + b]
     right = begin
@@ -233,8 +237,8 @@ def tie_node(a, b, obst_i):
 def _tie_code(a, b, obst_i):
     """Return the tie rule of edge `a` and the next edge `b`: fixed, or 2 * node + side of a below that node.
 
-    The walk takes the agent's side of a node first, then the node, then the other side; an edge that counts at all has
-    the agent on its right. So only a third node's side is left to ask for at run time.
+    The walk takes the agent's side of a node first, then the node, then the other side; an edge that counts
+    at all has the agent on its right. So only a third node's side is left to ask for at run time.
     """
     node, side_a, side_b = tie_node(a, b, obst_i)
     if side_a < 0:
@@ -271,7 +275,8 @@ def build_obstacles(vertices, polygon_start, obst_f, obst_i):
     vertices : ndarray of shape (V, 2), float64
         Vertices of all polygons [m], world frame. Anticlockwise = solid inside, clockwise = free inside.
     polygon_start : ndarray of shape (P + 1,), int64
-        Polygon p has vertices ``polygon_start[p]:polygon_start[p + 1]``; those with fewer than two are left out.
+        Polygon p has vertices ``polygon_start[p]:polygon_start[p + 1]``; those with fewer than two are left
+        out.
     obst_f : ndarray of shape (OF_FIELDS, capacity), float32
         Out. Columns beyond the returned number are not meaningful.
     obst_i : ndarray of shape (OI_FIELDS, capacity), int32
@@ -279,8 +284,8 @@ def build_obstacles(vertices, polygon_start, obst_f, obst_i):
 
     Notes
     -----
-    Same result as RVO2 2.0.3 ``RVOSimulator::addObstacle`` and ``KdTree::buildObstacleTreeRecursive``, edge for edge and
-    bit for bit; new edges are numbered depth first, left before right, as there.
+    Same result as RVO2 2.0.3 ``RVOSimulator::addObstacle`` and ``KdTree::buildObstacleTreeRecursive``, edge
+    for edge and bit for bit; new edges are numbered depth first, left before right, as there.
     """
     capacity = obst_f.shape[1]
     n = _add_polygons(vertices, polygon_start, obst_f, obst_i)

@@ -1,3 +1,4 @@
+# mypy: allow-untyped-defs, allow-untyped-decorators, no-check-untyped-defs
 """Random streams that live in an array, so that kernels draw without Python and a sequence owns its randomness.
 
 Two kinds, told apart by the last word:
@@ -12,8 +13,8 @@ without compilation.
 """
 
 import numpy as np
-from numba import njit
 
+from navrep_data._kernels import kernel
 from navrep_data.sim._layout import RNG_WORDS
 
 _MASK32 = np.uint64(0xFFFFFFFF)
@@ -36,14 +37,14 @@ _MT_LOWER = np.uint64(0x7FFFFFFF)
 _MT_MATRIX = np.uint64(0x9908B0DF)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _add64(a, b):
     low = (a & _MASK32) + (b & _MASK32)
     high = (a >> _S32) + (b >> _S32) + (low >> _S32)
     return ((high & _MASK32) << _S32) | (low & _MASK32)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _mul128(a, b):
     """Return the high and low 64 bits of a x b."""
     a0, a1 = a & _MASK32, a >> _S32
@@ -58,7 +59,7 @@ def _mul128(a, b):
     return high, low
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _philox_block(rng):
     """Advance the counter and fill the buffer with four words."""
     for i in range(4):
@@ -82,7 +83,7 @@ def _philox_block(rng):
     rng[_POS] = np.uint64(0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _mt_generate(rng):
     for i in range(624):
         y = (rng[i] & _MT_UPPER) | (rng[(i + 1) % 624] & _MT_LOWER)
@@ -93,7 +94,7 @@ def _mt_generate(rng):
     rng[_MT_POS] = np.uint64(0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _mt_uint32(rng):
     if rng[_MT_POS] >= np.uint64(624):
         _mt_generate(rng)
@@ -106,7 +107,7 @@ def _mt_uint32(rng):
     return y & _MASK32
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def seed_philox(rng, seed, sequence):
     """Start the Philox stream with key (seed, sequence)."""
     rng[:] = np.uint64(0)
@@ -116,7 +117,7 @@ def seed_philox(rng, seed, sequence):
     rng[_KIND] = _KIND_PHILOX
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def seed_mt(rng, seed):
     """Start the stream of ``numpy.random.RandomState(seed)``."""
     word = np.uint64(seed) & _MASK32
@@ -129,7 +130,7 @@ def seed_mt(rng, seed):
     rng[_KIND] = _KIND_MT
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def uniform(rng):
     """Return a float64 in [0, 1), as ``Generator.random`` or ``RandomState.random_sample`` do."""
     if rng[_KIND] == _KIND_MT:
@@ -143,7 +144,7 @@ def uniform(rng):
     return np.float64(word >> np.uint64(11)) * _INV53
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def integer(rng, low, high):
     """Return an integer in [low, high): ``RandomState.randint`` for MT19937, floor of a uniform for Philox."""
     span = high - low

@@ -1,3 +1,4 @@
+# mypy: allow-untyped-defs, allow-untyped-decorators, no-check-untyped-defs
 """Rows: whole sequences under a scripted policy, and batches of worlds stepped for anybody else.
 
 One row = one observation and the action taken from it. Both ways of making rows call the same functions in the same
@@ -5,8 +6,8 @@ order, so a sequence has the same bytes however it was made.
 """
 
 import numpy as np
-from numba import njit
 
+from navrep_data._kernels import kernel
 from navrep_data.sim._judge import CUT, NONE, STUCK
 from navrep_data.sim._layout import (
     A_GAIT_T,
@@ -38,7 +39,15 @@ from navrep_data.sim._layout import (
     S_STEP,
 )
 from navrep_data.sim._rng import uniform
-from navrep_data.sim._step import observe_humans, observe_scan, observe_state, orca_choice, pack_orca, reset_world, step_world
+from navrep_data.sim._step import (
+    observe_humans,
+    observe_scan,
+    observe_state,
+    orca_choice,
+    pack_orca,
+    reset_world,
+    step_world,
+)
 
 # make_vae_dataset.py, RandomMomentumPolicy: speed <- clip(speed + 0.1 (u - 0.5) - speed (0.01, 0.01, 0.1), +-0.5)
 MOMENTUM_NOISE = 0.1
@@ -49,8 +58,10 @@ MOMENTUM_LIMIT = 0.5
 GOAL_PULL = 0.05
 
 
-@njit(cache=True, error_model="numpy")
-def choose_action(agents, agents32, scalars, obst_f, obst_i, rng, params, flags, orca_params, work_f, work_i, memory, out):
+@kernel
+def choose_action(
+    agents, agents32, scalars, obst_f, obst_i, rng, params, flags, orca_params, work_f, work_i, memory, out
+):
     """Fill out (3,) with a scripted policy's body command; returns False where it gives up (ORCA's stuck rule).
 
     `memory` (3,) is the policy's own state, zero at the start of each episode.
@@ -62,7 +73,16 @@ def choose_action(agents, agents32, scalars, obst_f, obst_i, rng, params, flags,
         n = int(scalars[S_HUMANS])
         pack_orca(agents, n + 1, agents32)
         vx, vy = orca_choice(
-            0, agents, agents32, n, obst_f[-1], obst_i[-1], int(scalars[S_OBST_ROBOT]), orca_params, work_f, work_i
+            0,
+            agents,
+            agents32,
+            n,
+            obst_f[-1],
+            obst_i[-1],
+            int(scalars[S_OBST_ROBOT]),
+            orca_params,
+            work_f,
+            work_i,
         )
         wx, wy = np.float64(vx), np.float64(vy)
         if np.hypot(wx, wy) < params[P_STUCK_SPEED]:
@@ -97,7 +117,7 @@ def choose_action(agents, agents32, scalars, obst_f, obst_i, rng, params, flags,
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def store_scan(scan, range_max, out_mm):
     """Write a float32 scan [m] as millimetres: rounded half to even, at least 1."""
     for k in range(scan.shape[0]):
@@ -105,7 +125,7 @@ def store_scan(scan, range_max, out_mm):
         out_mm[k] = np.uint16(max(value, 1.0))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def note_episode(row, agents, scalars, vertices, polygon_start, episodes, corners, sizes, humans, counts):
     """Append the present episode's static side to the worlds tables; `counts` (4,) holds how full each of them is.
 
@@ -130,14 +150,18 @@ def note_episode(row, agents, scalars, vertices, polygon_start, episodes, corner
         humans[t, 0], humans[t, 1], humans[t, 2] = agents[i, A_X], agents[i, A_Y], agents[i, A_HEADING]
         humans[t, 3], humans[t, 4] = agents[i, A_GX], agents[i, A_GY]
         humans[t, 5], humans[t, 6] = agents[i, A_VPREF], agents[i, A_SEES]
-        humans[t, 7], humans[t, 8], humans[t, 9] = agents[i, A_GAIT_X], agents[i, A_GAIT_Y], agents[i, A_GAIT_T]
+        humans[t, 7], humans[t, 8], humans[t, 9] = (
+            agents[i, A_GAIT_X],
+            agents[i, A_GAIT_Y],
+            agents[i, A_GAIT_T],
+        )
     counts[0] = e + 1
     counts[1] = v + polygon_start[n_polygons]
     counts[2] = p + n_polygons
     counts[3] = h + n_humans
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def begin_row(
     row, agents, scalars, vertices, polygon_start, edges, circles, dirs, inv_work, owner_work, hits, scan32,
     params, flags, out_scan, out_floats, out_ints, out_humans, episodes, corners, sizes, humans, counts,
@@ -146,7 +170,18 @@ def begin_row(
     if scalars[S_STEP] == 0.0:
         note_episode(row, agents, scalars, vertices, polygon_start, episodes, corners, sizes, humans, counts)
     observe_scan(
-        agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, scan32
+        agents,
+        scalars,
+        edges,
+        polygon_start,
+        circles,
+        dirs,
+        inv_work,
+        owner_work,
+        hits,
+        params,
+        flags,
+        scan32,
     )
     if flags[F_SCAN_MM]:
         store_scan(scan32, params[P_RANGE_MAX], out_scan[row])
@@ -168,7 +203,7 @@ def begin_row(
         observe_humans(agents, int(scalars[S_HUMANS]), hits, out_humans[row])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def finish_row(
     row, length, pending, gave_up, action, agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i,
     boxes, rng, params, flags, orca_params, work_f, work_i, moves, result, out_floats, out_ints,
@@ -201,7 +236,7 @@ def finish_row(
     return NONE
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def rollout_sequence(
     agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, circles, dirs,
     inv_work, owner_work, hits, scan32, work_f, work_i, moves, params, flags, orca_params,
@@ -242,7 +277,7 @@ def rollout_sequence(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def begin_rows(
     row, agents, scalars, vertices, polygon_start, edges, circles, dirs, inv_work, owner_work, hits, scan32,
     params, flags, out_scan, out_floats, out_ints, out_humans, episodes, corners, sizes, humans, counts,
@@ -256,7 +291,7 @@ def begin_rows(
         )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def finish_rows(
     row, length, pending, gave_up, actions, agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i,
     boxes, rng, params, flags, orca_params, work_f, work_i, moves, result, out_floats, out_ints,

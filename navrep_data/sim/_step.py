@@ -1,8 +1,9 @@
+# mypy: allow-untyped-defs, allow-untyped-decorators, no-check-untyped-defs
 """One world: reset, step, observe. Everything that happens in the simulator happens here, for all callers."""
 
 import numpy as np
-from numba import njit
 
+from navrep_data._kernels import kernel
 from navrep_data.sim._judge import judge
 from navrep_data.sim._layout import (
     A_GAIT_T,
@@ -45,7 +46,7 @@ MAX_REDRAWS = 5
 TWO_PI = 2.0 * np.pi
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def fill_edges(vertices, polygon_start, n_polygons, edges):
     """Write the polygons' edges as rows x1, y1, x2, y2."""
     for p in range(n_polygons):
@@ -56,7 +57,7 @@ def fill_edges(vertices, polygon_start, n_polygons, edges):
             edges[v, 2], edges[v, 3] = vertices[w, 0], vertices[w, 1]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def build_trees(vertices, polygon_start, scalars, obst_f, obst_i):
     """Build the ORCA obstacle tree of a finished world; returns False where it does not fit."""
     n = int(scalars[S_POLYGONS])
@@ -66,7 +67,7 @@ def build_trees(vertices, polygon_start, scalars, obst_f, obst_i):
     return count >= 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def reset_world(agents, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags):
     """Draw the next episode of a world; returns False if no world fits the arrays."""
     episode = scalars[S_EPISODE]
@@ -80,7 +81,7 @@ def reset_world(agents, scalars, vertices, polygon_start, edges, obst_f, obst_i,
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def pack_orca(agents, n_agents, agents32):
     """Write the agents as RVO2 sees them: float32 x, y, vx, vy, radius + margin, largest speed."""
     for i in range(n_agents):
@@ -92,7 +93,7 @@ def pack_orca(agents, n_agents, agents32):
         agents32[i, 5] = agents[i, A_VPREF]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def orca_choice(i, agents, agents32, n_humans, obst_f, obst_i, n_obst, orca_params, work_f, work_i):
     """Return the ORCA velocity of agent i (0 = the robot, which sees all humans) [m/s], world frame."""
     px = agents[i, A_GX] - agents[i, A_X]
@@ -108,7 +109,7 @@ def orca_choice(i, agents, agents32, n_humans, obst_f, obst_i, n_obst, orca_para
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def choose_humans(agents, agents32, scalars, obst_f, obst_i, orca_params, work_f, work_i, moves):
     """Let every human choose its velocity from the present state; writes moves[1:]."""
     n = int(scalars[S_HUMANS])
@@ -120,7 +121,7 @@ def choose_humans(agents, agents32, scalars, obst_f, obst_i, orca_params, work_f
         moves[i, 1] = vy
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def move_humans(agents, n_humans, moves, dt):
     """Move the humans and their legs; a human that stands keeps its heading."""
     for i in range(1, n_humans + 1):
@@ -140,7 +141,7 @@ def move_humans(agents, n_humans, moves, dt):
         agents[i, A_GAIT_T] += heading - before
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def step_world(
     agents, agents32, scalars, edges, polygon_start, obst_f, obst_i,
     params, orca_params, work_f, work_i, moves, ax, ay, omega, result,
@@ -167,7 +168,7 @@ def step_world(
     scalars[S_STEP] += 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def fill_circles(agents, n_humans, legs, circles):
     """Write the humans' circles as the lidar sees them (two legs or one trunk); returns how many.
 
@@ -191,8 +192,10 @@ def fill_circles(agents, n_humans, legs, circles):
     return count
 
 
-@njit(cache=True, error_model="numpy")
-def observe_scan(agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, out):
+@kernel
+def observe_scan(
+    agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, out
+):  # fmt: skip
     """Fill out (n_rays,) float32 with the ranges from the robot's pose [m], and hits, the rays that end on each human."""
     n = int(scalars[S_HUMANS])
     n_circles = fill_circles(agents, n, flags[F_LEGS] != 0, circles)
@@ -204,7 +207,7 @@ def observe_scan(agents, scalars, edges, polygon_start, circles, dirs, inv_work,
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def observe_state(agents, scalars, out):
     """Fill out (5,) with goal x, goal y [m], vx, vy [m/s], omega [rad/s] in the robot frame."""
     c, s = np.cos(agents[0, A_HEADING]), np.sin(agents[0, A_HEADING])
@@ -217,7 +220,7 @@ def observe_state(agents, scalars, out):
     out[4] = scalars[S_OMEGA]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def observe_humans(agents, n_humans, hits, out):
     """Fill out (H, 6): position and velocity along the robot's axes, radius, visible; NaN in empty slots."""
     c, s = np.cos(agents[0, A_HEADING]), np.sin(agents[0, A_HEADING])

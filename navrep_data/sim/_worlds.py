@@ -1,3 +1,4 @@
+# mypy: allow-untyped-defs, allow-untyped-decorators, no-check-untyped-defs
 """Procedural worlds of the `consistent` physics.
 
 The recipe is the original's (crowd_sim.py, SIM_FACTS a.2 to a.5) with its defects mended: obstacles come first and
@@ -5,8 +6,8 @@ humans are only put where they are free, every loop is bounded, headings are uni
 """
 
 import numpy as np
-from numba import njit
 
+from navrep_data._kernels import kernel
 from navrep_data.sim._geometry import box_distance
 from navrep_data.sim._layout import (
     A_GX,
@@ -49,7 +50,7 @@ SQUARE_HALF = 0.7
 WALL_THICKNESS = 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def add_box(vertices, polygon_start, n, cx, cy, hx, hy, clockwise):
     """Append an axis-aligned box as polygon n and return n + 1; anticlockwise = solid inside (RVO2's convention)."""
     v = polygon_start[n]
@@ -66,13 +67,13 @@ def add_box(vertices, polygon_start, n, cx, cy, hx, hy, clockwise):
     return n + 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _place_obstacles(agents, vertices, polygon_start, boxes, rng, params):
     """Draw squares and walls clear of the robot's start and goal; returns the number of polygons."""
     scale = params[P_POLYGON_SCALE]
     half = params[P_MAP_HALF]
-    n_squares = int(round(uniform(rng) * params[P_SQUARES]))
-    n_walls = int(round(uniform(rng) * params[P_WALLS]))
+    n_squares = round(uniform(rng) * params[P_SQUARES])
+    n_walls = round(uniform(rng) * params[P_WALLS])
     gap = agents[0, A_RADIUS] + params[P_DANGER_DIST]
     n = 0
     for k in range(n_squares + n_walls):
@@ -98,7 +99,7 @@ def _place_obstacles(agents, vertices, polygon_start, boxes, rng, params):
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _fits(agents, n, i_x, i_y, x, y, radius, boxes, n_boxes, gap):
     """Return whether a human of this radius is free at (x, y) among agents 0..n-1 (columns i_x, i_y) and boxes."""
     for j in range(n):
@@ -111,10 +112,10 @@ def _fits(agents, n, i_x, i_y, x, y, radius, boxes, n_boxes, gap):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _place_humans(agents, boxes, n_boxes, rng, params, flags):
     """Draw humans free of each other, the robot and all obstacles at start and goal; returns their number."""
-    wanted = min(int(round(params[P_HUMANS] * (0.5 + uniform(rng)))), agents.shape[0] - 1)
+    wanted = min(round(params[P_HUMANS] * (0.5 + uniform(rng))), agents.shape[0] - 1)
     gap = params[P_DANGER_DIST]
     n = 1
     for _k in range(wanted):
@@ -155,7 +156,7 @@ def _place_humans(agents, boxes, n_boxes, rng, params, flags):
     return n - 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def add_border(agents, scalars, vertices, polygon_start, n_polygons, gap):
     """Close the world by a box `gap` outside everything in it (navreptrainenv.py); returns the number of polygons."""
     n_agents = int(scalars[S_HUMANS]) + 1
@@ -176,7 +177,7 @@ def add_border(agents, scalars, vertices, polygon_start, n_polygons, gap):
     return add_box(vertices, polygon_start, n_polygons, cx, cy, xmax - cx, ymax - cy, True)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def draw_world(agents, scalars, vertices, polygon_start, boxes, rng, params, flags):
     """Draw a world: robot, obstacles, humans, border. Fills agents, scalars, vertices and polygon_start.
 

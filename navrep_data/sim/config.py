@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from navrep_data.errors import ConfigError, did_you_mean
-from navrep_data.schema import DT, SensorContract
+from navrep_data.schema import SensorContract
 from navrep_data.sim import _layout as lay
 
 PHYSICS = ("consistent",)

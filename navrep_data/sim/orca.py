@@ -46,7 +46,8 @@ def orca_velocities(
     preferred : array_like of shape (N, 2)
         Preferred velocities [m/s], world frame.
     polygons : sequence of array_like of shape (V, 2), optional
-        Static obstacles [m], world frame; V at least 2. Anticlockwise = solid inside, clockwise = free inside.
+        Static obstacles [m], world frame; V at least 2. Anticlockwise = solid inside, clockwise = free
+        inside.
     neighbor_dist : float, optional
         Agents farther away do not count [m].
     max_neighbors : int, optional
@@ -68,10 +69,10 @@ def orca_velocities(
 
     Notes
     -----
-    Van den Berg et al., Reciprocal n-body collision avoidance (2011), as implemented by RVO2 2.0.3 (``doStep`` without
-    the motion), in float32 and to the same bits where the compiler of RVO2 does not fuse multiply and add. Difference:
-    more than ten agents at exactly equal distances are taken in the order of their rows. Two agents at the same place
-    with the same velocity ignore each other, as there.
+    Van den Berg et al., Reciprocal n-body collision avoidance (2011), as implemented by RVO2 2.0.3
+    (``doStep`` without the motion), in float32 and to the same bits where the compiler of RVO2 does not fuse
+    multiply and add. Difference: more than ten agents at exactly equal distances are taken in the order of
+    their rows. Two agents at the same place with the same velocity ignore each other, as there.
 
     Examples
     --------
@@ -148,7 +149,7 @@ def _matrix(name: str, value: ArrayLike, n: int | None) -> NDArray[np.float64]:
         array = array.reshape(0, 2)
     if array.ndim != 2 or array.shape[1] != 2 or (n is not None and len(array) != n):
         raise ConfigError(
-            f"{name} has shape {array.shape}; expected ({'N' if n is None else n}, 2). Pass one x, y pair per row."
+            f"{name} has shape {array.shape}; expected ({'N' if n is None else n}, 2). Pass rows of x, y."
         )
     _check_finite(name, array)
     return np.ascontiguousarray(array)
@@ -158,16 +159,22 @@ def _column(name: str, value: ArrayLike, n: int) -> NDArray[np.float64]:
     """Return `value` as (n,) float64 without negative numbers, or say what is wrong with it."""
     array = np.asarray(value, np.float64)
     if array.shape not in ((), (n,)):
-        raise ConfigError(f"{name} has shape {array.shape}; expected ({n},) or one number. Pass one per agent.")
+        raise ConfigError(
+            f"{name} has shape {array.shape}; expected ({n},) or one number. Pass one per agent."
+        )
     _check_finite(name, array)
     if (array < 0.0).any():
-        raise ConfigError(f"{name} holds {array.min():g}; expected no negative numbers. Check the order of arguments.")
+        raise ConfigError(
+            f"{name} holds {array.min():g}; expected no negative numbers. Check the order of arguments."
+        )
     return np.broadcast_to(array, (n,))
 
 
 def _check_finite(name: str, array: NDArray[np.float64]) -> None:
     if not np.isfinite(array).all():
-        raise ConfigError(f"{name} holds NaN or infinity; expected finite numbers. Remove or replace those rows.")
+        raise ConfigError(
+            f"{name} holds NaN or infinity; expected finite numbers. Remove or replace those rows."
+        )
 
 
 def _at_least(name: str, value: float, low: float) -> float:

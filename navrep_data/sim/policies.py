@@ -14,7 +14,7 @@ SCRIPTED = {
     "random-momentum": lay.POLICY_RANDOM_MOMENTUM,
     "constant-velocity": lay.POLICY_CONSTANT_VELOCITY,
 }
-"""Name -> code: ORCA with the stuck rule; momentum pulled to the goal; plain random momentum; one velocity an episode."""
+"""Name -> code: ORCA with stuck rule; momentum pulled to the goal; random momentum; one velocity per episode."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class ScriptedPolicy:
         """Check the name and the ranges."""
         if self.name not in SCRIPTED:
             raise UnknownNameError(
-                f"Unknown policy {self.name!r}.{did_you_mean(self.name, SCRIPTED)} Scripted ones: {', '.join(SCRIPTED)}; "
-                "your own: module:function."
+                f"Unknown policy {self.name!r}.{did_you_mean(self.name, SCRIPTED)} Scripted ones: "
+                f"{', '.join(SCRIPTED)}; your own: module:function."
             )
         for field in ("stuck_speed", "omega_noise", "speed"):
             value = getattr(self, field)

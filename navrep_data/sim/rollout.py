@@ -245,7 +245,7 @@ class CallableRollout:
             actions = np.concatenate([actions, np.zeros((n, 1))], axis=1)
         if actions.shape != (n, ACTION_SIZE):
             raise PolicyError(
-                f"The policy returned shape {actions.shape}, expected ({n}, 3) or ({n}, 2): vx, vy [m/s] and omega [rad/s]."
+                f"The policy returned shape {actions.shape}, expected ({n}, 3) or ({n}, 2): vx, vy [m/s], omega [rad/s]."
             )
         if not np.isfinite(actions).all():
             raise PolicyError("The policy returned NaN or infinity, expected finite velocities [m/s, m/s, rad/s].")

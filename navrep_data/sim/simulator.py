@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from navrep_data.sim._geometry import swept_clearance
 from navrep_data.sim._obstacles import OF_FIELDS, OI_FIELDS
 from navrep_data.sim._orca import make_orca_work
 from navrep_data.sim.config import SimConfig, kernel_flags, kernel_params, orca_params
+from navrep_data.sim.lidar import ray_directions
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -28,12 +30,6 @@ def check_seed(seed: int) -> int:
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed <= MAX_SEED:
         raise ConfigError(f"seed is {seed!r}, expected a whole number from 0 to {MAX_SEED}.")
     return int(seed)
-
-
-def ray_directions(config: SimConfig) -> F64:
-    """Return cosine and sine of every ray's angle in the robot frame, shape (2, n_rays)."""
-    angles = config.sensor.angle_min + np.arange(config.sensor.n_rays) * config.sensor.angle_increment
-    return np.ascontiguousarray(np.stack([np.cos(angles), np.sin(angles)]))
 
 
 class WorldArrays:
@@ -49,7 +45,7 @@ class WorldArrays:
         self.params = kernel_params(config)
         self.flags = kernel_flags(config)
         self.orca_params = orca_params(config)
-        self.dirs = ray_directions(config)
+        self.dirs = ray_directions(config.sensor)
         # per world
         self.agents = np.zeros((n, agents, lay.AGENT_FIELDS))
         self.scalars = np.zeros((n, lay.SCALAR_FIELDS))
@@ -225,7 +221,7 @@ class Simulator:
         return WorldState(
             robot=agents[0, columns].copy(),
             humans=agents[1 : n + 1, human_columns].copy(),
-            polygons=[a.vertices[world, i:j].copy() for i, j in zip(starts[:-1], starts[1:], strict=True)],
+            polygons=[a.vertices[world, i:j].copy() for i, j in pairwise(starts)],
             circles=a.circles[:count, :3].copy(),
             step=int(a.scalars[world, lay.S_STEP]),
         )

@@ -15,7 +15,11 @@ H = 3
 
 
 def make_sequence(
-    sequence: int, lengths: list[int], columns: tuple[str, ...], scan_dtype: str = "uint16", nan_goals: bool = False
+    sequence: int,
+    lengths: list[int],
+    columns: tuple[str, ...],
+    scan_dtype: str = "uint16",
+    nan_goals: bool = False,
 ) -> dict[str, np.ndarray]:
     """One sequence with episodes of the given lengths; `robot_state[:, 2]` = sequence, `[:, 3]` = row."""
     rng = np.random.default_rng([11, sequence])
@@ -58,7 +62,8 @@ def make_sequence(
         "leading_reward": rng.normal(size=n),
     }
     return {
-        name: np.ascontiguousarray(values[name], scan_dtype if name == "scan" else COLUMNS[name].dtype) for name in columns
+        name: np.ascontiguousarray(values[name], scan_dtype if name == "scan" else COLUMNS[name].dtype)
+        for name in columns
     }
 
 
@@ -121,7 +126,9 @@ def slow_windows(contents: list[dict[str, np.ndarray]], window: int, stride: int
         for row in range(rows):
             if columns["step"][row] % stride == 0:
                 count = 0
-                while count < window and row + count < rows and columns["episode"][row + count] == columns["episode"][row]:
+                while (
+                    count < window and row + count < rows and columns["episode"][row + count] == columns["episode"][row]
+                ):
                     count += 1
                 found.append((int(columns["sequence"][0]), row, count))
     return found

@@ -160,7 +160,7 @@ def test_resume_in_one_process(root, batch_size):
         for _ in range(stop):
             next(iterator)
         state = json.loads(json.dumps(dataset.state_dict()))
-        fresh = pickle.loads(pickle.dumps(stream(root, batch_size=batch_size)))
+        fresh = pickle.loads(pickle.dumps(stream(root, batch_size=batch_size)))  # noqa: S301
         fresh.load_state_dict(state)
         if stop < len(whole):
             assert fresh.state_dict() == state
@@ -172,7 +172,7 @@ def test_resume_in_one_process(root, batch_size):
 
 @pytest.mark.parametrize("own", [False, True])
 def test_resume_with_workers(root, expected, own):
-    """After n batches of a plain DataLoader, the state says what is left; so does a state taken after a resume."""
+    """After n batches of a plain DataLoader, the state says what is left; also when taken after a resume."""
     workers, size = 3, 2
 
     def fresh():
@@ -226,7 +226,7 @@ def test_a_state_of_something_else_is_refused(root):
             stream(root, **arguments).load_state_dict(state)
     dataset = stream(root)
     dataset.load_state_dict(state)
-    with pytest.raises(ConfigError, match="2 consumers .* this loader has 1"):
+    with pytest.raises(ConfigError, match=r"2 consumers .* this loader has 1"):
         next(iter(dataset))
     with pytest.raises(ConfigError, match="expected one per worker"):
         dataset.load_state_dict({**state, "positions": [1]})

@@ -13,7 +13,13 @@ import torch
 
 from navrep_data.datasets import SequenceDataset, import_npz
 from navrep_data.datasets.npz import FILE_SUFFIX, MAX_ROWS
-from navrep_data.errors import ConfigError, CorruptDataError, DatasetError, DatasetNotFoundError, FolderInUseError
+from navrep_data.errors import (
+    ConfigError,
+    CorruptDataError,
+    DatasetError,
+    DatasetNotFoundError,
+    FolderInUseError,
+)
 from navrep_data.schema import COLUMNS, Event
 from navrep_data.shards import DatasetFolder, verify
 
@@ -102,7 +108,8 @@ def test_a_small_file(tmp_path):
     last = np.flatnonzero(columns["is_last"])
     events = [Event(e).label for e in columns["event"][last]]
     assert list(zip(last.tolist(), events, strict=True)) == [
-        (9, "goal"), (29, "cut"), (30, "cut"), (45, "collision_obstacle"), (49, "stuck"), (50, "cut"), (59, "cut"),
+        (9, "goal"), (29, "cut"), (30, "cut"), (45, "collision_obstacle"),
+        (49, "stuck"), (50, "cut"), (59, "cut"),
     ]  # fmt: skip
     assert manifest.rows == 60
     assert manifest.scan_dtype == "float32"
@@ -118,9 +125,19 @@ def test_timeouts(tmp_path):
 
 
 def test_several_files_of_different_length_without_rings(tmp_path):
-    sources = [sequence(60, seed=1), sequence(51, unplayed=(30,), seed=2), sequence(1, (), (), (), (), seed=3)]
+    sources = [
+        sequence(60, seed=1),
+        sequence(51, unplayed=(30,), seed=2),
+        sequence(1, (), (), (), (), seed=3),
+    ]
     seen = []
-    manifest = import_npz(write(tmp_path / "in", *sources), tmp_path / "out", rings=False, env="irl", progress=lambda *a: seen.append(a))
+    manifest = import_npz(
+        write(tmp_path / "in", *sources),
+        tmp_path / "out",
+        rings=False,
+        env="irl",
+        progress=lambda *a: seen.append(a),
+    )
     assert (manifest.env, manifest.length, manifest.sequences) == ("irl", 60, 3)
     assert seen == [(1, 3), (2, 3), (3, 3)]
     assert "rings" not in manifest.columns
@@ -140,7 +157,8 @@ def test_windows_of_an_import_hold_no_nan(tmp_path):
         assert all(not torch.isnan(value).any() for value in window.values())
     assert dataset[0]["scan"][3, 5:9].tolist() == [0, 0, 25, 0]
     assert dataset[0]["goal_valid"][:10].tolist() == [i % 4 != 0 for i in range(10)]
-    # An action led to the first stored row of an episode, but to no frame of an episode that was never played.
+    # An action led to the first stored row of an episode, but to no frame of an episode that was never
+    # played.
     assert dataset[0]["action_valid"][:10].all()
     odd = next(w for i, w in enumerate(dataset) if dataset.info(i)["rows"] == 1)
     assert not odd["action_valid"].any()
@@ -204,8 +222,14 @@ def spoilt(name, value):
 @pytest.mark.parametrize(
     ("arrays", "words"),
     [
-        (spoilt("actions", np.array([None] * 60)), "array 'actions' holds pickled objects, which are never loaded"),
-        (spoilt("scans", np.zeros((60, 1080))), "array 'scans' is float64 .*, expected float32 \\('rows', 1080\\)"),
+        (
+            spoilt("actions", np.array([None] * 60)),
+            "array 'actions' holds pickled objects, which are never loaded",
+        ),
+        (
+            spoilt("scans", np.zeros((60, 1080))),
+            "array 'scans' is float64 .*, expected float32 \\('rows', 1080\\)",
+        ),
         (spoilt("scans", np.zeros((60, 720), np.float32)), "array 'scans' is float32 \\(60, 720\\)"),
         (spoilt("dones", np.zeros(60)), "array 'dones' is float64 .*, expected bool"),
         (spoilt("rewards", np.zeros((60, 1))), "array 'rewards' is float64 \\(60, 1\\)"),
@@ -245,7 +269,10 @@ def test_too_large_is_refused_before_it_is_read(tmp_path):
         np.lib.format.write_array_header_1_0(handle, {"descr": "<f4", "fortran_order": False, "shape": (10**10, 1080)})
     with pytest.raises(DatasetError, match=f"10,000,000,000 rows, expected 1 to {MAX_ROWS:,}"):
         import_npz(folder, tmp_path / "out")
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("scans.npy", "w") as handle:
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("scans.npy", "w") as handle,
+    ):
         np.lib.format.write_array_header_1_0(handle, {"descr": "<f4", "fortran_order": False, "shape": (60, 1080)})
         handle.write(bytes(50_000_000))
     with pytest.raises(CorruptDataError, match="array 'scans' has 50,000,128 bytes, expected 259,200 and a header"):
@@ -271,9 +298,9 @@ def test_damaged_files_are_refused(tmp_path):
 
 def test_sources_that_are_none(tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DatasetNotFoundError, match="There is nothing to import in .*empty"):
+    with pytest.raises(DatasetNotFoundError, match=r"There is nothing to import in .*empty"):
         import_npz(tmp_path / "empty", tmp_path / "out")
-    with pytest.raises(DatasetNotFoundError, match="There is no file .*gone.npz"):
+    with pytest.raises(DatasetNotFoundError, match=r"There is no file .*gone\.npz"):
         import_npz([tmp_path / "gone.npz"], tmp_path / "out")
 
 

@@ -82,7 +82,7 @@ def test_missing_unlisted_truncated(dataset):
 
 
 def spoil(root, monkeypatch, change):
-    """Write shard 0 again with a changed first sequence, its hashes right, so that only its meaning is wrong."""
+    """Write shard 0 again, its first sequence changed and its hashes right: only its meaning is wrong."""
     monkeypatch.setattr(writer_module, "check_index", lambda *_: "")
     monkeypatch.setattr(writer_module, "check_finite", lambda *_: "")
     manifest = Manifest.read(root)

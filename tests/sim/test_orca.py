@@ -14,6 +14,8 @@ import pytest
 from navrep_data.errors import ConfigError
 from navrep_data.sim._obstacles import build_obstacles, make_obstacles
 from navrep_data.sim._orca import make_orca_work, orca_velocity
+from navrep_data.sim._orca_lp import program2, program3
+from navrep_data.sim._orca_neighbors import WORK_EDGE, WORK_LINE, WORK_PROJ, obstacle_neighbors
 from navrep_data.sim.orca import obstacle_arrays, orca_velocities
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -69,9 +71,8 @@ def toward(goal, position):
 def ours(s, settings=SETTINGS):
     names = ("neighbor_dist", "max_neighbors", "time_horizon", "time_horizon_obst", "time_step")
     with np.errstate(all="ignore"):  # without the compiler, RVO2's own divisions by zero would warn
-        return orca_velocities(
-            s.position, s.velocity, s.radius, s.speed, s.preferred, s.polygons, **dict(zip(names, settings, strict=True))
-        )  # fmt: skip
+        keywords = dict(zip(names, settings, strict=True))
+        return orca_velocities(s.position, s.velocity, s.radius, s.speed, s.preferred, s.polygons, **keywords)
 
 
 def slow(s, settings=SETTINGS):
@@ -107,18 +108,20 @@ def assert_same(got, want):
         np.testing.assert_array_equal(got, want)
 
 
-# --- adversarial scenes ---------------------------------------------------------------------------------------------
+# --- adversarial scenes -------------------------------------------------------------------------------------
 
 
 def on_a_grid(rng):
-    """Everything on a half-metre grid: equal distances, shared corners, collinear edges, agents on top of others."""
+    """Everything on a half-metre grid: equal distances, shared corners, collinear edges, agents on agents."""
     s = scene(rng, agents=10, obstacles=0)
     s.position = rng.integers(-6, 7, (10, 2)) * 0.5
     s.velocity = rng.integers(-1, 2, (10, 2)) * 0.5
     s.preferred = rng.integers(-2, 3, (10, 2)) * 0.5
     s.radius = np.full(10, 0.5)
     s.speed = np.full(10, 1.0)
-    s.polygons = [box(*(rng.integers(-6, 7, 2) * 0.5), *(rng.integers(1, 4, 2) * 0.5)) for _ in range(8)] + [border(4.0)]
+    s.polygons = [box(*(rng.integers(-6, 7, 2) * 0.5), *(rng.integers(1, 4, 2) * 0.5)) for _ in range(8)] + [
+        border(4.0)
+    ]
     return s
 
 
@@ -202,7 +205,13 @@ def test_many_scenes_equal_rvo2():
 
 
 @pytest.mark.parametrize(
-    "settings", [(3.0, 3, 2.0, 1.0, 0.1), (10.0, 0, 5.0, 5.0, 0.2), (100.0, 40, 10.0, 20.0, 0.5), (0.5, 2, 0.5, 0.1, 1.0)]
+    "settings",
+    [
+        (3.0, 3, 2.0, 1.0, 0.1),
+        (10.0, 0, 5.0, 5.0, 0.2),
+        (100.0, 40, 10.0, 20.0, 0.5),
+        (0.5, 2, 0.5, 0.1, 1.0),
+    ],
 )
 def test_other_settings_equal_rvo2(settings):
     rng = np.random.default_rng(3)
@@ -223,17 +232,68 @@ def test_rollouts_equal_rvo2():
             s.preferred = toward(s.goal, s.position)
 
 
-def test_search_range_cut_by_the_tree():
-    """An edge just inside the range, behind a line that rounding puts just outside, is counted as RVO2 does."""
+def test_neighbours_at_the_end_of_the_range_equal_the_walk():
+    """RVO2's walk prunes by distances to lines, which rounding can put beyond the range before the edge itself."""
     rng = np.random.default_rng(11)
-    for _ in range(200 if JIT else 3):
-        s = scene(rng, agents=1, obstacles=0, edge=False)
-        s.speed[:], s.radius[:] = 1.0, 0.5
-        reach = np.float32(5.5) * (1 + rng.integers(-3, 4) * 1e-7)
-        x, y = rng.uniform(-3, 3, 2)
-        s.polygons = [box(x, y, 1, 1), box(x, y + 2, 1, 1), box(x - 5, y, 1, 1)]
-        s.position[0] = (x + 1 + reach, y + 1.0)
-        assert_same(ours(s), rvo2(s)[0])
+    cut = 0
+    for k in range(60 if JIT else 4):
+        s = thin_and_concave(rng) if k % 3 == 1 else scene(rng, agents=1, obstacles=12)
+        if k % 3 == 2:  # specks, whose lines leave the side of other edges open by decimetres
+            s.polygons += [box(*rng.uniform(-4, 4, 2), 1e-4, 1e-4) for _ in range(12)]
+        edges = oracles_orca.make_edges(s.polygons)
+        tree = oracles_orca.build_tree(list(edges), edges)
+        index = {id(e): j for j, e in enumerate(edges)}
+        f, i, n = obstacle_arrays(s.polygons)
+        work_f, work_i = make_orca_work(f.shape[1], 1)
+        for _ in range(10):
+            corner = edges[rng.integers(n)].point  # straight out from a corner, along an axis
+            x, y = np.float32([corner.x, corner.y])
+            x, y = (
+                (x + np.float32(rng.uniform(-6, 6)), y)
+                if rng.random() < 0.5
+                else (x, y + np.float32(rng.uniform(-6, 6)))
+            )
+            p = oracles_orca.V(x, y)
+            with np.errstate(all="ignore"):
+                all_of_them: list = []
+                oracles_orca.walk(tree, p, np.float32(np.inf), all_of_them)
+                for d in [d for d, _ in all_of_them if d > 0][:12]:
+                    range_sq = np.nextafter(d, np.float32(np.inf))
+                    want: list = []
+                    oracles_orca.walk(tree, p, range_sq, want)
+                    got = obstacle_neighbors(x, y, range_sq, f, i, n, work_f, work_i)
+                    assert list(work_i[WORK_EDGE, :got]) == [index[id(e)] for _, e in want]
+                    cut += len(want) < sum(other < range_sq for other, _ in all_of_them)
+    assert cut > 0 or not JIT, "no scene in which the walk loses an edge: this test would show nothing"
+
+
+@pytest.mark.parametrize("kinds", [3, 8, 1000])
+def test_linear_programs_equal_the_slow_ones(kinds):
+    """Lines of few directions: parallel ones of both senses, infeasible programs, failures among obstacle lines."""
+    rng = np.random.default_rng(kinds)
+    work = make_orca_work(16, 16)[0]
+    fails = set()
+    for _ in range(2000 if JIT else 60):
+        n, n_obstacle = int(rng.integers(1, 12)), int(rng.integers(0, 6))
+        n_obstacle = min(n, n_obstacle)
+        angle = rng.integers(0, kinds, n) * (2 * np.pi / kinds) + rng.choice([0.0, 4e-6], n)  # nearly parallel too
+        rows = np.stack([*rng.normal(0, 0.7, (2, n)), np.cos(angle), np.sin(angle)], 1).astype(np.float32)
+        work[:] = 7.0  # scratch is never clean
+        lines = work[WORK_LINE]
+        lines[: 4 * n] = rows.ravel()
+        x, y = np.float32(rng.normal(0, 0.7, 2))
+        speed = np.float32(rng.uniform(0.5, 1.5))
+        slow_lines = [(oracles_orca.V(*r[:2]), oracles_orca.V(*r[2:])) for r in rows]
+        with np.errstate(all="ignore"):
+            failed, gx, gy = program2(lines, n, speed, x, y, False)
+            slow_failed, best = oracles_orca.program2(slow_lines, speed, oracles_orca.V(x, y), False)
+            assert (failed, gx, gy) == (slow_failed, best.x, best.y)
+            if failed < n:
+                fails.add(failed < n_obstacle)
+                gx, gy = program3(lines, n_obstacle, n, failed, speed, gx, gy, work[WORK_PROJ])
+                best = oracles_orca.program3(slow_lines, n_obstacle, failed, speed, best)
+                assert (gx, gy) == (best.x, best.y)
+    assert fails == {True, False}
 
 
 @pytest.mark.parametrize("make", [scene, *ADVERSARIAL], ids=lambda f: f.__name__)

@@ -73,7 +73,10 @@ def test_time_is_up_after_35_seconds(empty):
         assert events[0] == (Event.TIMEOUT if step == 174 else Event.NONE)
 
 
-@pytest.mark.parametrize(("gap", "event", "reward"), [(0.3, Event.NONE, 0.0), (0.19, Event.NONE, -1.0), (-0.01, Event.COLLISION_HUMAN, -26.0)])
+@pytest.mark.parametrize(
+    ("gap", "event", "reward"),
+    [(0.3, Event.NONE, 0.0), (0.19, Event.NONE, -1.0), (-0.01, Event.COLLISION_HUMAN, -26.0)],
+)
 def test_human_clearance_decides(crowd, gap, event, reward):
     put_human(crowd, 0.0, 0.7 + gap)
     rewards, events = crowd.step([[0.0, 0.0, 0.0]])
@@ -94,7 +97,11 @@ def test_walls_collide_by_distance(empty):
     robot = empty.arrays.agents[0, 0]
     robot[lay.A_X] = 0.5 * (empty.arrays.scalars[0, lay.S_XMIN] + empty.arrays.scalars[0, lay.S_XMAX])
     robot[[lay.A_GX, lay.A_GY]] = robot[lay.A_X], 0.0
-    for gap, event, danger in ((0.25, Event.NONE, 0.0), (0.15, Event.NONE, -1.0), (-0.01, Event.COLLISION_OBSTACLE, -26.0)):
+    for gap, event, danger in (
+        (0.25, Event.NONE, 0.0),
+        (0.15, Event.NONE, -1.0),
+        (-0.01, Event.COLLISION_OBSTACLE, -26.0),
+    ):
         robot[lay.A_Y] = ymin + 0.4 + gap + 0.1
         rewards, events = empty.step([[-0.5, 0.0, 0.0]])
         assert events[0] == event
@@ -106,7 +113,7 @@ def test_humans_walk_with_their_legs(crowd):
     crowd.arrays.agents[0, 1, [lay.A_GX, lay.A_GY]] = 3.0, -3.0
     for _ in range(3):
         crowd.step([[0.0, 0.0, 0.0]])
-    x, y, vx, vy, theta = crowd.state().humans[0, :5]
+    x, y, vx, _, theta = crowd.state().humans[0, :5]
     assert (x, vx) == (pytest.approx(3.0, abs=1e-5), pytest.approx(0.0, abs=1e-5))
     assert y == pytest.approx(3.0 - 0.6, abs=1e-5)
     assert theta == pytest.approx(1.5 * np.pi, abs=1e-4)

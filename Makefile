@@ -1,0 +1,63 @@
+# Two commands set up everything on a fresh machine: `make demo` and `make test`.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+DEMO ?= data/demo
+
+.PHONY: help install demo test check format bench bench-peers test-nojit test-boundscheck coverage wheel clean
+
+help:  ## List the targets.
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 20
+
+install: $(STAMP)  ## Make the virtual environment with everything that development needs.
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.12 ...")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
+	touch $@
+
+demo: $(STAMP)  ## Generate a small dataset, print its summary, load windows through a DataLoader.
+	$(BIN)/navrep-data generate --env soadrl --n 20 --out $(DEMO)
+	$(BIN)/navrep-data info $(DEMO)
+	$(BIN)/python examples/load_windows.py $(DEMO)
+
+test: $(STAMP)  ## Run the whole test suite, slow tests included.
+	$(BIN)/python -m pytest -m "slow or not slow" $(PYTEST_ARGS)
+
+check: $(STAMP)  ## Format, lint, types, import contracts.
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(STAMP)  ## Format and fix what can be fixed.
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+KERNEL_TESTS := tests/sim tests/observations
+
+test-nojit: $(STAMP)  ## Run the kernel tests as plain Python.
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) $(PYTEST_ARGS)
+
+test-boundscheck: $(STAMP)  ## Run the kernel tests with every array index checked.
+	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNEL_TESTS) $(PYTEST_ARGS)
+
+coverage: $(STAMP)  ## Line coverage of sim and observations, measured on plain Python.
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) --cov=navrep_data.sim --cov=navrep_data.observations \
+	  --cov-report=term-missing:skip-covered --cov-fail-under=95 $(PYTEST_ARGS)
+
+bench: $(STAMP)  ## Measure speed and size; writes benchmarks/RESULTS.md.
+	$(BIN)/python benchmarks/run.py --write
+
+bench-peers: $(STAMP)  ## Measure other simulators beside ours; writes benchmarks/RESULTS.md.
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev,peers]"
+	$(BIN)/python benchmarks/peers.py --write
+
+wheel: $(STAMP)  ## Build the wheel into dist/.
+	rm -rf dist
+	$(BIN)/python -m build --wheel --outdir dist .
+
+clean:  ## Remove the virtual environment and everything built.
+	rm -rf $(VENV) dist build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .coverage*
