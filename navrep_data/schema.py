@@ -144,8 +144,9 @@ COLUMNS: dict[str, Column] = {
         Column("step", (), "int32", "", "row index within the episode"),
         Column("robot_pose", (3,), "float32", "m, m, rad", "x, y, theta in the world frame; NaN where unknown", may_be_nan=True),
         Column("robot_radius", (), "float32", "m", "robot radius; NaN where unknown", may_be_nan=True),
-        Column("humans", (HUMANS_AXIS, len(HUMAN_FIELDS)), "float32", "m, m, m/s, m/s, m, -", "x, y, vx, vy along the robot's axes, radius, visible; one slot per human per episode, NaN-padded", wide=True, may_be_nan=True, optional=True),
-        Column("leading_action", (ACTION_SIZE,), "float32", "m/s, m/s, rad/s", "action that led to this row (imports only)", optional=True),
-        Column("leading_reward", (), "float32", "", "reward that came with this row (imports only)", optional=True),
+        Column("humans", (HUMANS_AXIS, len(HUMAN_FIELDS)), "float32", "m, m, m/s, m/s, m, -", "x, y, vx, vy along the robot's axes (rounded to 1/1024), radius, visible; one slot per human per episode, NaN-padded", wide=True, may_be_nan=True, optional=True),
+        Column("leading_action", (ACTION_SIZE,), "float64", "m/s, m/s, rad/s", "action that led to this row (imports only)", optional=True),
+        Column("leading_reward", (), "float64", "", "reward that came with this row (imports only)", optional=True),
+        Column("source_robot_state", (ROBOT_STATE_SIZE,), "float64", "m, m, m/s, m/s, rad/s", "robot_state with the source's precision, so that imports export unchanged", may_be_nan=True, optional=True),
     )
 }  # fmt: skip

@@ -328,9 +328,7 @@ def program3(lines, n_obstacle, begin, radius, best):
     return best
 
 
-def orca_velocities(
-    positions, velocities, radii, max_speeds, preferred, polygons=(), settings=(10, 10, 5, 5, 0.2)
-):
+def orca_velocities(positions, velocities, radii, max_speeds, preferred, polygons=(), settings=(10, 10, 5, 5, 0.2)):
     """Return (N, 2) float32 new velocities; `settings` as in RVO2: distance, number, horizons, time step."""
     neighbor_dist, most, tau, tau_obst, dt = settings
     with np.errstate(all="ignore"):

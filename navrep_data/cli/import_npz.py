@@ -17,12 +17,13 @@ def import_npz_command(
     ],
     out: Annotated[Path, typer.Option("--out", help="Dataset folder, new or empty.")],
     env: Annotated[str, typer.Option("--env", help="Name to record as the environment.")] = "imported",
+    range_max: Annotated[float, typer.Option("--range-max", help="Largest range of the recorded sensor [m].")] = 25.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Convert sequences recorded by the original NavRep into a dataset."""
     from navrep_data.datasets import import_npz
 
-    manifest = import_npz(files, out, env=env)
+    manifest = import_npz(files, out, env=env, range_max=range_max)
     if as_json:
         print_json(
             {

@@ -212,6 +212,7 @@ def align(arrays: Arrays, sequence: int) -> Arrays:
         "robot_radius": np.full(n, np.nan),
         "leading_action": actions,
         "leading_reward": rewards,
+        "source_robot_state": arrays["robotstates"],
     }
     return {name: np.ascontiguousarray(values, COLUMNS[name].dtype) for name, values in columns.items()}
 

@@ -30,7 +30,7 @@ MAX_SEQUENCES = 2**31 - 1
 MAX_LENGTH = 100_000
 # An estimate of compressed size is good to a few per cent; ask for a little more.
 DISK_MARGIN = 1.1
-_GENERATED_COLUMNS = tuple(name for name in COLUMNS if not name.startswith("leading_"))
+_GENERATED_COLUMNS = tuple(name for name in COLUMNS if not name.startswith(("leading_", "source_")))
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,11 @@ from navrep_data.observations import _rings
 def _check_range_max(range_max: float) -> None:
     if not (np.isfinite(range_max) and range_max > 0.0):
         raise ConfigError(
-            f"range_max is {range_max}, expected a positive number of metres: take it from the sensor "
-            "contract."
+            f"range_max is {range_max}, expected a positive number of metres: take it from the sensor contract."
         )
 
 
-def scan_to_1d(
-    scan: ArrayLike, range_max: float = schema.RANGE_MAX, clip: bool = False
-) -> NDArray[np.float32]:
+def scan_to_1d(scan: ArrayLike, range_max: float = schema.RANGE_MAX, clip: bool = False) -> NDArray[np.float32]:
     """Scale scans for models that read them as a line of numbers.
 
     Parameters
@@ -52,8 +49,7 @@ def scan_to_1d(
     array = np.asarray(scan)
     if not np.issubdtype(array.dtype, np.floating):
         raise ArrayError(
-            f"scan has dtype {array.dtype}, expected floating metres: use metres_from_millimetres for a "
-            "stored scan."
+            f"scan has dtype {array.dtype}, expected floating metres: use metres_from_millimetres for a stored scan."
         )
     scaled = array.astype(np.float32) / np.float32(range_max)
     return np.clip(scaled, np.float32(0), np.float32(1)) if clip else scaled
@@ -90,9 +86,7 @@ def millimetres_from_metres(scan: ArrayLike, range_max: float = schema.RANGE_MAX
         )
     array = np.asarray(scan)
     if not np.issubdtype(array.dtype, np.floating):
-        raise ArrayError(
-            f"scan has dtype {array.dtype}, expected floating metres: it may be in millimetres already."
-        )
+        raise ArrayError(f"scan has dtype {array.dtype}, expected floating metres: it may be in millimetres already.")
     flat = np.ascontiguousarray(array, dtype=np.float32).reshape(-1)
     out = np.empty(flat.shape, np.uint16)
     _rings.millimetres_row(flat, float(range_max), out)
@@ -119,9 +113,7 @@ def metres_from_millimetres(scan: ArrayLike) -> NDArray[np.float32]:
     """
     array = np.asarray(scan)
     if array.dtype != np.uint16:
-        raise ArrayError(
-            f"scan has dtype {array.dtype}, expected uint16 millimetres: floating scans are in metres."
-        )
+        raise ArrayError(f"scan has dtype {array.dtype}, expected uint16 millimetres: floating scans are in metres.")
     return array.astype(np.float32) / np.float32(1000)
 
 

@@ -27,7 +27,7 @@ CHUNK_RANGE = (12, 40)
 # HDF5 keeps a chunk index entry and a header per narrow chunk, so one chunk per sequence; but not megabytes
 # in one.
 NARROW_CHUNK_MAX = 4096
-VECTOR_COLUMNS = ("robot_state", "action", "robot_pose", "leading_action", "humans")
+VECTOR_COLUMNS = ("robot_state", "action", "robot_pose", "leading_action", "source_robot_state", "humans")
 """Columns whose last axis holds different quantities: their statistics are lists, one entry per component."""
 
 # Measured at 20 rows per chunk: scan and rings on one of the original's sequences; humans (17.5 of 30 slots
@@ -39,8 +39,9 @@ BYTES_PER_ROW: dict[str, float] = {
     "action": 8.7,
     "reward": 3.7,
     "robot_pose": 7.6,
-    "leading_action": 8.5,
-    "leading_reward": 3.5,
+    "leading_action": 20.0,
+    "leading_reward": 8.0,
+    "source_robot_state": 26.0,
 }
 _BYTES_PER_FLOAT32_RAY = 2.55
 _BYTES_PER_HUMAN_SLOT = 11.5
@@ -104,8 +105,7 @@ def column_order(names: Iterable[str]) -> tuple[str, ...]:
     for name in given:
         if name not in COLUMNS:
             raise ConfigError(
-                f"Unknown column {name!r}; expected some of {', '.join(COLUMNS)}."
-                f"{did_you_mean(name, COLUMNS)}"
+                f"Unknown column {name!r}; expected some of {', '.join(COLUMNS)}.{did_you_mean(name, COLUMNS)}"
             )
     if len(set(given)) != len(given):
         raise ConfigError(f"Columns {given} hold a name twice; expected each once.")
@@ -175,9 +175,7 @@ def column_attributes(layout: Layout) -> dict[str, str | float]:
     return attributes
 
 
-def estimate_bytes(
-    columns: Iterable[str], rows: int, *, n_rays: int, scan_dtype: str, max_humans: int
-) -> int:
+def estimate_bytes(columns: Iterable[str], rows: int, *, n_rays: int, scan_dtype: str, max_humans: int) -> int:
     """Return about how many bytes `rows` rows take on disk, worlds included.
 
     Parameters

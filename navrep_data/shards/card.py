@@ -36,10 +36,7 @@ def _front_matter(m: Manifest) -> str:
         "- reinforcement-learning",
         "- robotics",
         "tags:",
-        *(
-            f"- {tag}"
-            for tag in ("navrep", "robot-navigation", "lidar", "crowd", "orca", "world-models", "hdf5")
-        ),
+        *(f"- {tag}" for tag in ("navrep", "robot-navigation", "lidar", "crowd", "orca", "world-models", "hdf5")),
         "size_categories:",
         f"- {_size_category(m.rows)}",
         "configs:",
@@ -106,8 +103,7 @@ def _limits(m: Manifest) -> str:
     lines = ["* Simulated: flat ground, a planar lidar without noise, humans that follow ORCA."]
     if m.scan_dtype == "uint16":
         lines.append(
-            "* Scans are rounded to millimetres: about 1 frame in 8 has one rings cell one bin off that of "
-            "float32."
+            "* Scans are rounded to millimetres: about 1 frame in 8 has one rings cell one bin off that of float32."
         )
     lines += [
         "* Equal bytes for the same command are promised for one package version, locked dependencies and "

@@ -67,9 +67,7 @@ class Episodes:
         if split is None:
             return np.arange(len(self))
         if split not in SPLITS:
-            raise ConfigError(
-                f"Unknown split {split!r}; expected {', '.join(SPLITS)}.{did_you_mean(split, SPLITS)}"
-            )
+            raise ConfigError(f"Unknown split {split!r}; expected {', '.join(SPLITS)}.{did_you_mean(split, SPLITS)}")
         return np.flatnonzero(self.split == SPLITS.index(split))
 
 
@@ -173,8 +171,7 @@ class DatasetFolder:
             first = np.flatnonzero(shard.read("is_first", 0, shard.rows))
             if not len(first) or first[0] != 0:
                 raise CorruptDataError(
-                    f"{shard.path} does not start with an episode's first row; "
-                    f"run `navrep-data verify {self.root}`."
+                    f"{shard.path} does not start with an episode's first row; run `navrep-data verify {self.root}`."
                 )
             stop = np.append(first[1:], shard.rows)
             parts.append(

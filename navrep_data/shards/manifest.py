@@ -196,8 +196,7 @@ class Manifest:
         if not path.is_file():
             seen = "has no manifest.json" if root.is_dir() else "is not a folder"
             raise DatasetNotFoundError(
-                f"No dataset in {root}: it {seen}. "
-                f"Expected a folder written by `navrep-data generate --out {root}`."
+                f"No dataset in {root}: it {seen}. Expected a folder written by `navrep-data generate --out {root}`."
             )
         try:
             values = read_json(path)
@@ -325,15 +324,9 @@ def _parse(fields: Fields, root: Path) -> Manifest:
 def _parse_sensor(fields: Fields) -> SensorContract:
     values = fields.get("sensor", dict)
     names = SensorContract().to_dict()
-    if set(values) != set(names) or any(
-        isinstance(v, bool) or not isinstance(v, int | float) for v in values.values()
-    ):
+    if set(values) != set(names) or any(isinstance(v, bool) or not isinstance(v, int | float) for v in values.values()):
         fields.bad("sensor", f"numbers named {', '.join(names)}")
-    if (
-        not isinstance(values["n_rays"], int)
-        or not 1 <= values["n_rays"] <= 1 << 20
-        or values["range_max"] <= 0
-    ):
+    if not isinstance(values["n_rays"], int) or not 1 <= values["n_rays"] <= 1 << 20 or values["range_max"] <= 0:
         fields.bad("sensor", "n_rays of 1 or more and range_max above 0")
     return SensorContract(**values)
 
@@ -342,9 +335,7 @@ def _parse_statistics(fields: Fields, columns: Sequence[str]) -> dict[str, Any]:
     values: dict[str, Any] = fields.get("statistics", dict)
     problem = check_statistics(values, columns) if values else ""
     if problem:
-        raise CorruptDataError(
-            f"{fields.path}: field '{fields.prefix}statistics' {problem}; get the file again."
-        )
+        raise CorruptDataError(f"{fields.path}: field '{fields.prefix}statistics' {problem}; get the file again.")
     return values
 
 

@@ -153,9 +153,7 @@ class Shard:
         """
         layout = self._layout(column)
         if not 0 <= start <= stop <= self.rows:
-            raise IndexError(
-                f"Rows {start} to {stop} are not in {self.path}; expected within 0 to {self.rows}."
-            )
+            raise IndexError(f"Rows {start} to {stop} are not in {self.path}; expected within 0 to {self.rows}.")
         chunked = self._chunked.get(column)
         if not layout.column.wide or chunked is None:
             return (
@@ -183,9 +181,7 @@ class Shard:
         layout = self._layout(column)
         rows = np.asarray(indices, dtype=np.int64)
         if rows.size and not (rows.min() >= 0 and rows.max() < self.rows):
-            raise IndexError(
-                f"Rows {rows.min()} to {rows.max()} are not all in {self.path}, which has {self.rows}."
-            )
+            raise IndexError(f"Rows {rows.min()} to {rows.max()} are not all in {self.path}, which has {self.rows}.")
         chunked = self._chunked.get(column)
         if not layout.column.wide:
             return self._whole(column, chunked)[rows]
@@ -201,9 +197,7 @@ class Shard:
         try:
             return self.columns[column]
         except KeyError:
-            raise KeyError(
-                f"{self.path} has no column {column!r}; it has {', '.join(self.columns)}."
-            ) from None
+            raise KeyError(f"{self.path} has no column {column!r}; it has {', '.join(self.columns)}.") from None
 
     def _corrupt(self, what: str) -> CorruptDataError:
         return CorruptDataError(f"{self.path} {what}. {_ADVICE}.")
@@ -256,9 +250,7 @@ class Shard:
             raise self._corrupt(f"holds a column {name!r} that format version {FORMAT_VERSION} does not have")
         plist = dataset.id.get_create_plist()
         if dataset.is_virtual or plist.get_external_count():
-            raise self._corrupt(
-                f"column {name!r} takes its data from other files; expected plain columns only"
-            )
+            raise self._corrupt(f"column {name!r} takes its data from other files; expected plain columns only")
         if dataset.dtype.hasobject or dataset.dtype.fields or dataset.dtype.subdtype:
             raise self._corrupt(f"column {name!r} holds references or objects; expected plain numbers")
         for k in range(plist.get_nfilters()):

@@ -47,9 +47,7 @@ class Moments:
     def empty(cls, components: int) -> Moments:
         """Return the moments of nothing."""
         zeros = np.zeros(components)
-        return cls(
-            zeros, zeros.copy(), zeros.copy(), np.full(components, np.inf), np.full(components, -np.inf)
-        )
+        return cls(zeros, zeros.copy(), zeros.copy(), np.full(components, np.inf), np.full(components, -np.inf))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Moments:
@@ -205,8 +203,7 @@ class ShardStatistics:
     def to_dict(self) -> dict[str, Any]:
         """Return JSON values: ``columns``, ``outcomes``, ``humans_per_episode``."""
         columns = {
-            name: moments.to_dict(self.scan_scale if name == "scan" else 1.0)
-            for name, moments in self.columns.items()
+            name: moments.to_dict(self.scan_scale if name == "scan" else 1.0) for name, moments in self.columns.items()
         }
         return {
             "columns": columns,

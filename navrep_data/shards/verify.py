@@ -187,11 +187,7 @@ def _check_shard(root: Path, manifest: Manifest, entry: ShardEntry) -> Iterator[
         return
     try:
         shard = Shard(safe_join(root, entry.file), entry)
-        if (
-            tuple(shard.columns) != manifest.columns
-            or shard.sensor != manifest.sensor
-            or shard.env != manifest.env
-        ):
+        if tuple(shard.columns) != manifest.columns or shard.sensor != manifest.sensor or shard.env != manifest.env:
             yield Problem(entry.file, "has other columns, another sensor or environment than the manifest")
             return
         starts = yield from _check_rows(shard, manifest, entry)
@@ -289,7 +285,5 @@ def _check_worlds(root: Path, entry: FileEntry, starts: npt.NDArray[Any] | None)
         yield Problem(entry.file, str(error))
         return
     a = worlds.arrays
-    if starts is not None and not np.array_equal(
-        np.stack([a["sequence"], a["episode"], a["row"]], axis=1), starts
-    ):
+    if starts is not None and not np.array_equal(np.stack([a["sequence"], a["episode"], a["row"]], axis=1), starts):
         yield Problem(entry.file, "its episodes are not those of the shard")

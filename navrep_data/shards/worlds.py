@@ -234,9 +234,7 @@ def worlds_bytes(arrays: Arrays) -> bytes:
     members = {}
     for name in _FIELDS:
         buffer = io.BytesIO()
-        np.lib.format.write_array(
-            buffer, np.ascontiguousarray(arrays[name]), version=(1, 0), allow_pickle=False
-        )
+        np.lib.format.write_array(buffer, np.ascontiguousarray(arrays[name]), version=(1, 0), allow_pickle=False)
         members[f"{name}.npy"] = buffer.getvalue()
     return _zip_bytes(members)
 
@@ -278,9 +276,7 @@ def parse_worlds(data: bytes, where: str) -> Worlds:
         problem = check_worlds(arrays)
         if problem:
             raise ValueError(problem)
-    except (
-        Exception
-    ) as error:  # damaged zips raise a dozen kinds, NotImplementedError and struct.error among them
+    except Exception as error:  # damaged zips raise a dozen kinds, NotImplementedError and struct.error among them
         reason = str(error).rstrip(".") or type(error).__name__
         raise CorruptDataError(f"{where} is not a worlds file: {reason}; {_ADVICE}.") from error
     return Worlds(arrays)
@@ -302,7 +298,5 @@ def read_worlds(path: Path | str) -> Worlds:
     path = Path(path)
     size = path.stat().st_size
     if size > MAX_WORLDS_BYTES:
-        raise CorruptDataError(
-            f"{path} has {size:,} bytes, expected at most {MAX_WORLDS_BYTES:,}; {_ADVICE}."
-        )
+        raise CorruptDataError(f"{path} has {size:,} bytes, expected at most {MAX_WORLDS_BYTES:,}; {_ADVICE}.")
     return parse_worlds(path.read_bytes(), str(path))

@@ -219,9 +219,7 @@ class ShardWriter:
             for. The writer is then as before the call.
         """
         if self._finished:
-            raise RuntimeError(
-                "ShardWriter.finish was called; expected no more sequences. Make a new ShardWriter."
-            )
+            raise RuntimeError("ShardWriter.finish was called; expected no more sequences. Make a new ShardWriter.")
         index = self._first_sequence + len(self._hashes)
         ready = self._checked(columns, index)
         part = None
@@ -263,9 +261,7 @@ class ShardWriter:
         if bad:
             raise CorruptDataError(f"{where}: {bad}; expected finite numbers.")
         if "rings" in ready and ready["rings"].max() > 2:
-            raise CorruptDataError(
-                f"{where}: column 'rings' holds {ready['rings'].max()}; expected 0, 1 or 2."
-            )
+            raise CorruptDataError(f"{where}: column 'rings' holds {ready['rings'].max()}; expected 0, 1 or 2.")
         problem = check_index(ready, index)
         if problem:
             raise CorruptDataError(f"{where}: {problem}.")
@@ -280,8 +276,7 @@ class ShardWriter:
             and (part["sequence"] == index).all()
         ):
             raise CorruptDataError(
-                f"Sequence {index}: worlds 'sequence', 'episode', 'row' do not match its "
-                f"{len(starts)} episodes."
+                f"Sequence {index}: worlds 'sequence', 'episode', 'row' do not match its {len(starts)} episodes."
             )
 
     def _store(self, name: str, array: npt.NDArray[Any]) -> None:
@@ -305,14 +300,10 @@ class ShardWriter:
             If there is no sequence.
         """
         if not self._hashes:
-            raise CorruptDataError(
-                "A shard without sequences; expected at least one before ShardWriter.finish."
-            )
+            raise CorruptDataError("A shard without sequences; expected at least one before ShardWriter.finish.")
         self._finished = True
         room = sum(len(c) + 64 for chunks in self._chunks.values() for c in chunks) + _HEADER_ROOM
-        with h5py.File(
-            "shard", "w", driver="core", backing_store=False, block_size=room, libver=_LIBVER
-        ) as file:
+        with h5py.File("shard", "w", driver="core", backing_store=False, block_size=room, libver=_LIBVER) as file:
             for name, value in self._attributes().items():
                 file.attrs[name] = value
             for name, layout in self.layouts.items():
@@ -339,9 +330,7 @@ class ShardWriter:
             "env": self._env,
             "config": json.dumps(self._config, allow_nan=False),
             "seed": np.uint64(self._seed),
-            "sequences": np.array(
-                [self._first_sequence, self._first_sequence + len(self._hashes)], dtype="<i8"
-            ),
+            "sequences": np.array([self._first_sequence, self._first_sequence + len(self._hashes)], dtype="<i8"),
             "rows": np.int64(self._rows),
             "length": np.int64(self._length),
             "n_rays": np.int64(sensor.n_rays),

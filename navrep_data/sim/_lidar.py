@@ -61,11 +61,7 @@ def bearing(y, x):
         + z
         * (
             -0.333173681
-            + z
-            * (
-                0.1980781577
-                + z * (-0.132333424 + z * (0.0796236728 + z * (-0.03360421819 + z * 0.006811791911)))
-            )
+            + z * (0.1980781577 + z * (-0.132333424 + z * (0.0796236728 + z * (-0.03360421819 + z * 0.006811791911))))
         )
     )
     if ay > ax:
@@ -311,9 +307,7 @@ def scan_world(
 
 
 @kernel
-def scan_poses(
-    edges, poly_start, circles, poses, directions, angle_min, angle_increment, range_max, gap_quirk, out
-):
+def scan_poses(edges, poly_start, circles, poses, directions, angle_min, angle_increment, range_max, gap_quirk, out):
     """Scan one world from poses (N, 3) into out (N, n_rays); each circle is its own owner."""
     n_rays, n_circles = directions.shape[1], circles.shape[0]
     inverse, owner_of_ray = np.empty(n_rays), np.empty(n_rays, np.int32)

@@ -55,9 +55,7 @@ INF = np.float32(np.inf)
 NEAR_RANGE = np.float32(0.998)
 
 
-def make_orca_work(
-    max_edges: int = 512, max_agents: int = 64
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def make_orca_work(max_edges: int = 512, max_agents: int = 64) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Return ``(work_f, work_i)``, the scratch arrays of :func:`orca_velocity`.
 
     Parameters

@@ -44,6 +44,7 @@ ORCA_MARGIN = 0.01
 # Worlds whose obstacle tree does not fit are drawn again; the sixth in a row means that the config asks for too many.
 MAX_REDRAWS = 5
 TWO_PI = 2.0 * np.pi
+HUMANS_GRID = 1024.0  # steps per metre (and per m/s) of the humans column
 
 
 @kernel
@@ -229,10 +230,11 @@ def observe_humans(agents, n_humans, hits, out):
             dx = agents[i + 1, A_X] - agents[0, A_X]
             dy = agents[i + 1, A_Y] - agents[0, A_Y]
             vx, vy = agents[i + 1, A_VX], agents[i + 1, A_VY]
-            out[i, 0] = c * dx + s * dy
-            out[i, 1] = c * dy - s * dx
-            out[i, 2] = c * vx + s * vy
-            out[i, 3] = c * vy - s * vx
+            # rounded to about the scan's resolution: what lies below is noise that would not compress
+            out[i, 0] = np.rint((c * dx + s * dy) * HUMANS_GRID) / HUMANS_GRID
+            out[i, 1] = np.rint((c * dy - s * dx) * HUMANS_GRID) / HUMANS_GRID
+            out[i, 2] = np.rint((c * vx + s * vy) * HUMANS_GRID) / HUMANS_GRID
+            out[i, 3] = np.rint((c * vy - s * vx) * HUMANS_GRID) / HUMANS_GRID
             out[i, 4] = agents[i + 1, A_RADIUS]
             out[i, 5] = 1.0 if hits[i] > 0 else 0.0
         else:

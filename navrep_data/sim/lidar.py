@@ -75,12 +75,7 @@ def polygon_edges(polygons: Sequence[ArrayLike]) -> tuple[NDArray[np.float64], N
     start = np.zeros(len(polygons) + 1, np.int64)
     for p, polygon in enumerate(polygons):
         vertices = np.asarray(polygon, dtype=np.float64)
-        if (
-            vertices.ndim != 2
-            or vertices.shape[0] < 2
-            or vertices.shape[1] != 2
-            or not np.isfinite(vertices).all()
-        ):
+        if vertices.ndim != 2 or vertices.shape[0] < 2 or vertices.shape[1] != 2 or not np.isfinite(vertices).all():
             raise ArrayError(
                 f"Polygon {p} has shape {vertices.shape}, expected at least two finite vertices (V, 2): "
                 "drop or repair it."

@@ -159,22 +159,16 @@ def _column(name: str, value: ArrayLike, n: int) -> NDArray[np.float64]:
     """Return `value` as (n,) float64 without negative numbers, or say what is wrong with it."""
     array = np.asarray(value, np.float64)
     if array.shape not in ((), (n,)):
-        raise ConfigError(
-            f"{name} has shape {array.shape}; expected ({n},) or one number. Pass one per agent."
-        )
+        raise ConfigError(f"{name} has shape {array.shape}; expected ({n},) or one number. Pass one per agent.")
     _check_finite(name, array)
     if (array < 0.0).any():
-        raise ConfigError(
-            f"{name} holds {array.min():g}; expected no negative numbers. Check the order of arguments."
-        )
+        raise ConfigError(f"{name} holds {array.min():g}; expected no negative numbers. Check the order of arguments.")
     return np.broadcast_to(array, (n,))
 
 
 def _check_finite(name: str, array: NDArray[np.float64]) -> None:
     if not np.isfinite(array).all():
-        raise ConfigError(
-            f"{name} holds NaN or infinity; expected finite numbers. Remove or replace those rows."
-        )
+        raise ConfigError(f"{name} holds NaN or infinity; expected finite numbers. Remove or replace those rows.")
 
 
 def _at_least(name: str, value: float, low: float) -> float:

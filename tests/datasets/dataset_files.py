@@ -60,6 +60,7 @@ def make_sequence(
         "humans": humans,
         "leading_action": rng.normal(size=(n, 3)),
         "leading_reward": rng.normal(size=n),
+        "source_robot_state": state,
     }
     return {
         name: np.ascontiguousarray(values[name], scan_dtype if name == "scan" else COLUMNS[name].dtype)
@@ -73,7 +74,7 @@ def write_dataset(
     *,
     shard_size: int = 2,
     scan_dtype: str = "uint16",
-    without: tuple[str, ...] = ("leading_action", "leading_reward"),
+    without: tuple[str, ...] = ("leading_action", "leading_reward", "source_robot_state"),
     nan_goals: bool = False,
 ) -> list[dict[str, np.ndarray]]:
     """Write a dataset of sequences given by their episodes' lengths; return the columns of each sequence."""

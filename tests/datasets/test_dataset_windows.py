@@ -85,7 +85,9 @@ def test_default_fields_hold_the_rows_and_zeros_past_the_episode(made, lidar, pr
 
 def test_rings_are_computed_where_the_dataset_has_none(made, tmp_path):
     root, _ = made
-    write_dataset(tmp_path / "d", SEQUENCES, without=("rings", "leading_action", "leading_reward"))
+    write_dataset(
+        tmp_path / "d", SEQUENCES, without=("rings", "leading_action", "leading_reward", "source_robot_state")
+    )
     for preload in (False, True):
         computed = SequenceDataset(tmp_path / "d", "rings", targets=True, preload=preload)
         stored = SequenceDataset(root, "rings", targets=True)
@@ -165,8 +167,9 @@ def test_leading_of_an_import_is_the_stored_one(tmp_path):
     contents = write_dataset(tmp_path / "d", [[10, 20]], without=())
     columns = contents[0]
     batch = SequenceDataset(tmp_path / "d", None, window=30, across_episodes=False, action="leading").batch([0, 1])
-    np.testing.assert_array_equal(batch["action"][0, :10], columns["leading_action"][:10])
-    np.testing.assert_array_equal(batch["action"][1, :20], columns["leading_action"][10:])
+    leading = columns["leading_action"].astype(np.float32)
+    np.testing.assert_array_equal(batch["action"][0, :10], leading[:10])
+    np.testing.assert_array_equal(batch["action"][1, :20], leading[10:])
     assert batch["action_valid"].sum(1).tolist() == [10, 20]
 
 

@@ -45,9 +45,7 @@ def test_edges_are_the_originals(golden):
 
 @pytest.mark.parametrize("name", ["", "edge_", "rays1080_", "rays720_", "rays360_", "rays64_"])
 def test_rings_are_the_originals(golden, name):
-    np.testing.assert_array_equal(
-        obs.scan_to_rings(golden[f"{name}scans"]), golden[f"{name}rings_raw"][..., 0]
-    )
+    np.testing.assert_array_equal(obs.scan_to_rings(golden[f"{name}scans"]), golden[f"{name}rings_raw"][..., 0])
 
 
 @pytest.mark.parametrize(
@@ -122,9 +120,7 @@ def test_leading_dimensions_strides_and_out():
     rings = obs.scan_to_rings(scans)
     assert rings.shape == (2, 3, 64, 64)
     np.testing.assert_array_equal(rings[1, 2], obs.scan_to_rings(scans[1, 2]))
-    np.testing.assert_array_equal(
-        obs.scan_to_rings(scans[:, ::2, ::-1]), obs.scan_to_rings(scans[:, ::2, ::-1].copy())
-    )
+    np.testing.assert_array_equal(obs.scan_to_rings(scans[:, ::2, ::-1]), obs.scan_to_rings(scans[:, ::2, ::-1].copy()))
     np.testing.assert_array_equal(obs.scan_to_rings(scans.astype(np.float64)), rings)
     out = np.full_like(rings, 9)
     assert obs.scan_to_rings(scans, out=out) is out

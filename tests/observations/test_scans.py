@@ -21,9 +21,7 @@ def test_millimetres_round_half_to_even():
 
 
 def test_millimetres_of_special_ranges():
-    scan = np.array(
-        [np.nan, -1.0, -np.inf, 0.0, -0.0, 1e-6, 0.0004, 0.0016, np.inf, 25.0, 25.0001, 1e30], np.float32
-    )
+    scan = np.array([np.nan, -1.0, -np.inf, 0.0, -0.0, 1e-6, 0.0004, 0.0016, np.inf, 25.0, 25.0001, 1e30], np.float32)
     expected = [0, 0, 0, 0, 0, 1, 1, 2, 25000, 25000, 25000, 25000]
     np.testing.assert_array_equal(obs.millimetres_from_metres(scan), expected)
     assert obs.millimetres_from_metres(np.float32([np.inf]), range_max=65.0).tolist() == [65000]
@@ -42,9 +40,7 @@ def test_one_dimensional_scans():
     scan = np.array([[0.0, 12.5, 25.0, 50.0]], np.float32)
     np.testing.assert_array_equal(obs.scan_to_1d(scan), [[0, 0.5, 1, 2]])
     np.testing.assert_array_equal(obs.scan_to_1d(scan, clip=True), [[0, 0.5, 1, 1]])
-    np.testing.assert_array_equal(
-        obs.scan_to_1d(scan.astype(np.float64), range_max=50.0), [[0, 0.25, 0.5, 1]]
-    )
+    np.testing.assert_array_equal(obs.scan_to_1d(scan.astype(np.float64), range_max=50.0), [[0, 0.25, 0.5, 1]])
     assert obs.scan_to_1d(scan.astype(np.float64)).dtype == np.float32
     assert scan[0, 3] == 50, "the input is left as it was"
 
@@ -61,9 +57,7 @@ def test_robot_state_is_in_the_robot_frame():
     np.testing.assert_array_equal(many[2, 1], obs.robot_state(goals[2, 0], poses[1], velocities[2, 1], 0.0))
     # Turning back by the heading gives the world frame.
     theta = poses[1, 2]
-    back = (
-        np.array([[math.cos(theta), -math.sin(theta)], [math.sin(theta), math.cos(theta)]]) @ many[2, 1, :2]
-    )
+    back = np.array([[math.cos(theta), -math.sin(theta)], [math.sin(theta), math.cos(theta)]]) @ many[2, 1, :2]
     np.testing.assert_allclose(back + poses[1, :2], goals[2, 0], atol=1e-6)
 
 

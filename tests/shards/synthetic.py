@@ -63,6 +63,7 @@ def make_sequence(
         "humans": humans,
         "leading_action": rng.normal(size=(rows, 3)).astype(COLUMNS["leading_action"].dtype),
         "leading_reward": rng.normal(size=rows).astype(COLUMNS["leading_reward"].dtype),
+        "source_robot_state": rng.normal(size=(rows, 5)),
     }
     n_episodes, n_humans = len(starts), int(per_episode.sum())
     polygons = rng.integers(1, 4, n_episodes)

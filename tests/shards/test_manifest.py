@@ -60,9 +60,7 @@ def test_default_splits_are_stable_and_cover_everything():
         where = {k: name for name, ranges in splits.items() for a, b in ranges for k in range(a, b)}
         assert sorted(where) == list(range(n))
         later = default_splits(n + 13)
-        assert all(
-            any(a <= k < b for a, b in later[name]) and name == split_of(k) for k, name in where.items()
-        )
+        assert all(any(a <= k < b for a, b in later[name]) and name == split_of(k) for k, name in where.items())
     assert all(default_splits(3)[name] for name in SPLITS)
 
 
@@ -195,9 +193,9 @@ def test_folder_reads_and_indexes(dataset):
     names = ("sequence", "episode", "shard", "start", "length", "event", "split")
     assert [tuple(row) for row in zip(*(getattr(episodes, n) for n in names), strict=True)] == expected
     assert set(episodes.event) <= set(Event)
-    assert len(episodes.in_split("val")) + len(episodes.in_split("test")) + len(
-        episodes.in_split("train")
-    ) == len(expected)
+    assert len(episodes.in_split("val")) + len(episodes.in_split("test")) + len(episodes.in_split("train")) == len(
+        expected
+    )
     with pytest.raises(ConfigError, match="Did you mean 'train'"):
         episodes.in_split("trian")
     again = pickle.loads(pickle.dumps(folder))  # noqa: S301

@@ -111,9 +111,7 @@ def test_sequence_hash_ignores_rings_chunks_and_nan_payloads():
         changed[name].reshape(-1)[0] += 1
         third = make_writer()
         third.append(changed, worlds)
-        assert (third.finish().sequence_hashes == a.sequence_hashes) == np.isnan(
-            changed[name].reshape(-1)[0]
-        ), name
+        assert (third.finish().sequence_hashes == a.sequence_hashes) == np.isnan(changed[name].reshape(-1)[0]), name
 
 
 def test_attributes_serve_plain_h5py(tmp_path):

@@ -20,9 +20,7 @@ GOLDEN = Path(__file__).resolve().parents[2].parent / "shared" / "golden" / "tes
 PURE_PYTHON = bool(config.DISABLE_JIT)
 WORLDS = 6 if PURE_PYTHON else 150
 NO_CIRCLES = np.empty((0, 3))
-BORDER = np.array(
-    [[-10.0, 10.0], [10.0, 10.0], [10.0, -10.0], [-10.0, -10.0]]
-)  # clockwise, as in the original
+BORDER = np.array([[-10.0, 10.0], [10.0, 10.0], [10.0, -10.0], [-10.0, -10.0]])  # clockwise, as in the original
 COARSE = SensorContract(n_rays=90, angle_increment=2 * math.pi / 90)
 SENSORS = {
     "original": SensorContract(),
@@ -129,9 +127,7 @@ def test_no_ray_slips_between_edges_that_share_a_corner():
             scan = scan_polygons([polygon], NO_CIRCLES, [x, y, theta], contract)
             assert scan.max() < 9.001, "a ray left a closed room"
             edges, _ = polygon_edges([polygon])
-            wrong, _ = wrong_rays(
-                scan, edges, NO_CIRCLES, (x, y, theta), angles_of(contract), contract.range_max
-            )
+            wrong, _ = wrong_rays(scan, edges, NO_CIRCLES, (x, y, theta), angles_of(contract), contract.range_max)
             assert wrong.size == 0
 
 
@@ -172,9 +168,7 @@ def test_sensor_inside_overlapping_boxes_sees_them_from_within():
 )
 def test_concave_polygons_from_within_and_without(pose):
     corner = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]])
-    star = np.array(
-        [[math.cos(k * 0.7) * (1 + k % 2), math.sin(k * 0.7) * (1 + k % 2)] for k in range(9)]
-    ) - [4, 4]
+    star = np.array([[math.cos(k * 0.7) * (1 + k % 2), math.sin(k * 0.7) * (1 + k % 2)] for k in range(9)]) - [4, 4]
     for polygons in ([corner, star, BORDER], [corner[::-1], star[::-1], BORDER[::-1]]):
         check(polygons, NO_CIRCLES, np.array(pose), SENSORS["original"])
 
@@ -367,9 +361,7 @@ def test_scans_of_the_original_environment():
         pytest.skip("needs ../shared (golden/test_env_traces.npz)")
     different, corrected = [], 0
     with np.load(GOLDEN) as data:
-        for episode, step, polygons, legs, pose, expected in golden_scenes(
-            data, (6,) if PURE_PYTHON else range(10)
-        ):
+        for episode, step, polygons, legs, pose, expected in golden_scenes(data, (6,) if PURE_PYTHON else range(10)):
             scan = scan_polygons(list(polygons), legs, pose, gap_quirk=True)
             different += [(episode, step, int(r)) for r in np.flatnonzero(np.abs(scan - expected) > 1e-3)]
             right = scan_polygons(list(polygons), legs, pose)

@@ -267,6 +267,24 @@ def test_neighbours_at_the_end_of_the_range_equal_the_walk():
     assert cut > 0 or not JIT, "no scene in which the walk loses an edge: this test would show nothing"
 
 
+@pytest.mark.parametrize("x", [-0.3, 0.3])
+def test_a_speck_of_an_edge_hides_what_sticks_out_behind_it(x):
+    """The wall ends 5 cm on the agent's side of the speck's line, which RVO2 forgives, and so prunes the wall."""
+    polygons = [np.array([[0.0, 0.0], [1e-4, 0.0]]), np.array([[0.0, -0.05], [0.0, 3.0]])]
+    edges = oracles_orca.make_edges(polygons)
+    tree = oracles_orca.build_tree(list(edges), edges)
+    f, i, n = obstacle_arrays(polygons)
+    work_f, work_i = make_orca_work(f.shape[1], 1)
+    counts = []
+    for range_sq in np.float32([3.95, 4.5]):
+        want: list = []
+        oracles_orca.walk(tree, oracles_orca.V(x, -2.0), range_sq, want)
+        got = obstacle_neighbors(np.float32(x), np.float32(-2.0), range_sq, f, i, n, work_f, work_i)
+        assert got == len(want)
+        counts.append(got)
+    assert counts[0] == 0 < counts[1]
+
+
 @pytest.mark.parametrize("kinds", [3, 8, 1000])
 def test_linear_programs_equal_the_slow_ones(kinds):
     """Lines of few directions: parallel ones of both senses, infeasible programs, failures among obstacle lines."""
