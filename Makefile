@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO ?= data/demo
 
-.PHONY: help install demo test check format bench bench-peers test-nojit test-boundscheck coverage wheel clean
+.PHONY: help install demo test check format bench bench-peers test-nojit test-boundscheck coverage kill-test wheel clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 20
@@ -47,6 +47,9 @@ test-boundscheck: $(STAMP)  ## Run the kernel tests with every array index check
 coverage: $(STAMP)  ## Line coverage of sim and observations, measured on plain Python.
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) --cov=navrep_data.sim --cov=navrep_data.observations \
 	  --cov-report=term-missing:skip-covered --cov-fail-under=95 $(PYTEST_ARGS)
+
+kill-test: $(STAMP)  ## 200 random SIGKILLs of generate (CI runs 10).
+	NAVREP_DATA_KILLS=200 $(BIN)/python -m pytest -m slow tests/generate/test_kill.py -s
 
 bench: $(STAMP)  ## Measure speed and size; writes benchmarks/RESULTS.md.
 	$(BIN)/python benchmarks/run.py --write

@@ -13,6 +13,9 @@ from navrep_data.cli._common import print_json, say, say_err, show_progress
 if TYPE_CHECKING:
     from navrep_data.generate import GenerateResult
 
+# Loading cached kernels takes about a second.
+COMPILED_SECONDS = 8.0
+
 
 def _cores() -> int:
     try:
@@ -98,6 +101,8 @@ def _print_summary(result: GenerateResult) -> None:
         f"{result.bytes / 1e6:,.1f} MB ({result.bytes / result.rows / 1e3:.2f} kB/row)"
     )
     if result.new_rows:
-        say(f"made {result.new_rows:,} rows in {result.seconds:.1f} s: {result.rows_per_s:,.0f} rows/s")
+        speed = f"made {result.new_rows:,} rows in {result.seconds:.1f} s: {result.rows_per_s:,.0f} rows/s"
+        compiled = result.setup_seconds > COMPILED_SECONDS
+        say(speed + (f" (after {result.setup_seconds:.0f} s of compiling kernels)" if compiled else ""))
     say(f"{episodes:,} episodes: {outcomes}")
     say(f"next: navrep-data info {result.root}")

@@ -14,7 +14,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from navrep_data.errors import DatasetError
+from navrep_data.errors import CorruptDataError, DatasetError
 from navrep_data.generate.executors import LocalExecutor
 from navrep_data.generate.plan import (
     Request,
@@ -30,7 +30,15 @@ from navrep_data.generate.plan import (
 from navrep_data.generate.policy import load_callable, make_policy
 from navrep_data.generate.worker import STAGING, ShardTask, seconds_per_row
 from navrep_data.io import PART_SUFFIX, sha256_file
-from navrep_data.shards import MANIFEST_FILE, Manifest, ShardEntry, dataset_card, writer_lock
+from navrep_data.shards import (
+    MANIFEST_FILE,
+    Manifest,
+    ShardEntry,
+    ShardRecipe,
+    dataset_card,
+    read_recipe,
+    writer_lock,
+)
 from navrep_data.sim import PolicyFunction, check_seed, make_config
 
 MAX_WORKERS = 256
@@ -55,9 +63,11 @@ class GenerateResult:
     new_rows : int
         Rows made by this run.
     seconds : float
-        Wall time of this run, compilation included [s].
+        Wall time of making them: simulate, compress, hash, write, start workers [s].
     rows_per_s : float
         `new_rows` / `seconds`.
+    setup_seconds : float
+        Wall time before that: imports, and compiling kernels where they are not cached [s].
     outcomes : dict of str to int
         Episodes by event, of the whole dataset.
     """
@@ -70,6 +80,7 @@ class GenerateResult:
     new_rows: int
     seconds: float
     rows_per_s: float
+    setup_seconds: float
     outcomes: dict[str, int] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
@@ -180,7 +191,7 @@ def generate(
         if not existed:
             _remove_if_unused(root)
         raise
-    seconds = time.perf_counter() - started
+    seconds = max(time.perf_counter() - run.began, 1e-6)
     manifest = run.manifest
     return GenerateResult(
         root=str(root),
@@ -191,6 +202,7 @@ def generate(
         new_rows=run.new_rows,
         seconds=round(seconds, 3),
         rows_per_s=round(run.new_rows / seconds, 1),
+        setup_seconds=round(run.began - started, 3),
         outcomes={name: o["episodes"] for name, o in manifest.statistics["outcomes"].items()},
     )
 
@@ -238,6 +250,7 @@ class _Run:
         self.root = request.spec.root
         self.say = say
         self.new_rows = 0
+        self.began = time.perf_counter()
         self._saved_at = 0.0
         self._save_seconds = 0.0
         if (self.root / MANIFEST_FILE).exists():
@@ -247,7 +260,10 @@ class _Run:
         self._entries = {entry.sequences: entry for entry in self.manifest.shards}
 
     def _resume(self, explicit_shard_size: bool) -> Manifest:
-        old = Manifest.read(self.root)
+        try:
+            old = Manifest.read(self.root)
+        except CorruptDataError as error:
+            return self._start_over(error)
         check_same(old, self.request, explicit_shard_size)
         if old.versions != versions():
             changed = [f"{k} {old.versions.get(k)} -> {v}" for k, v in versions().items() if old.versions.get(k) != v]
@@ -258,6 +274,24 @@ class _Run:
             e for k, e in enumerate(old.shards) if self._intact(e, hashed=k >= len(old.shards) - RECHECKED_SHARDS)
         )
         return replace(old, shards=kept, planned=self.request.n, command=self.request.command, complete=False)
+
+    def _start_over(self, error: CorruptDataError) -> Manifest:
+        """Return an empty manifest for a dataset whose own one is lost, if making it again can only restore it.
+
+        Every shard that can still be read must have been made with the settings of this request: then what is
+        written over them are their own bytes.
+        """
+        spec = self.request.spec
+        wanted = ShardRecipe(spec.config.env, spec.config.to_dict(), spec.seed, spec.settings.length)
+        for path in sorted((self.root / "data").glob("*.h5")):
+            try:
+                found = read_recipe(path)
+            except CorruptDataError:
+                continue
+            if found != wanted:
+                raise error
+        self.say(f"{MANIFEST_FILE} is damaged; making the dataset again.")
+        return new_manifest(self.request)
 
     def _intact(self, entry: ShardEntry, *, hashed: bool) -> bool:
         for part in (entry, entry.worlds):
@@ -298,6 +332,7 @@ class _Run:
         self._announce(done_rows, workers)
         if self._entries or not (self.root / MANIFEST_FILE).exists():
             self._save()
+        self.began = time.perf_counter()
         executor = LocalExecutor(self.request.spec, workers)
         with tqdm(
             total=self.request.rows,

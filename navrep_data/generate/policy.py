@@ -94,9 +94,7 @@ def load_callable(name: str) -> PolicyFunction:
     if isinstance(found, type):
         found = found()
     if not callable(found):
-        raise PolicyError(
-            f"Policy {name!r} is a {type(found).__name__}, expected a callable (scan, robot_state)."
-        )
+        raise PolicyError(f"Policy {name!r} is a {type(found).__name__}, expected a callable (scan, robot_state).")
     return found  # type: ignore[no-any-return]
 
 

@@ -111,7 +111,7 @@ def make_shard(
     DiskSpaceError
         If there is no room; what is in place stays as it was.
     """
-    writer = _writer(spec, task.first)
+    writer = new_writer(spec, task.first)
     for start in range(task.first, task.stop, rollout.batch):
         group = range(start, min(start + rollout.batch, task.stop))
         for columns, worlds in rollout.run(group):
@@ -122,7 +122,8 @@ def make_shard(
     return publish(root, task.index, writer.finish())
 
 
-def _writer(spec: DatasetSpec, first_sequence: int) -> ShardWriter:
+def new_writer(spec: DatasetSpec, first_sequence: int) -> ShardWriter:
+    """Return the writer of the shard that starts at this sequence."""
     return ShardWriter(
         env=spec.config.env,
         config=spec.config.to_dict(),
@@ -146,7 +147,7 @@ def seconds_per_row(spec: DatasetSpec) -> float:
     seconds = 0.0
     for sequence in (0, 1):  # the first one compiles
         begun = time.perf_counter()
-        writer = _writer(short, sequence)
+        writer = new_writer(short, sequence)
         for columns, worlds in rollout.run([sequence]):
             writer.append(columns, worlds)
         writer.finish()

@@ -16,6 +16,7 @@ from navrep_data.shards.folder import DatasetFolder, Episodes, info
 from navrep_data.shards.lock import LOCK_FILE, writer_lock
 from navrep_data.shards.manifest import CARD_FILE, MANIFEST_FILE, Manifest
 from navrep_data.shards.reader import Shard
+from navrep_data.shards.recipe import ShardRecipe, read_recipe
 from navrep_data.shards.statistics import merge_statistics
 from navrep_data.shards.verify import Problem, VerifyReport, verify
 from navrep_data.shards.worlds import WORLD_FIELDS, EpisodeWorld, Worlds, read_worlds
@@ -38,6 +39,7 @@ __all__ = [
     "Shard",
     "ShardEntry",
     "ShardImage",
+    "ShardRecipe",
     "ShardWriter",
     "VerifyReport",
     "Worlds",
@@ -49,6 +51,7 @@ __all__ = [
     "info",
     "merge_statistics",
     "publish",
+    "read_recipe",
     "read_worlds",
     "sequence_hash",
     "shard_file",

@@ -16,6 +16,7 @@ import pytest
 
 from navrep_data.errors import (
     ConfigError,
+    CorruptDataError,
     DatasetLockedError,
     DatasetMismatchError,
     DiskSpaceError,
@@ -138,6 +139,29 @@ def test_a_damaged_shard_is_made_again(reference, tmp_path, harm):
     generate(n=7, out=root, report=lines.append, **SMALL)
     assert any("shard-00001" in line and "making it again" in line for line in lines)
     assert tree(root) == reference[2]
+
+
+@pytest.mark.parametrize("cut", [0, 1, 500])
+def test_a_cut_manifest_is_made_again(reference, tmp_path, cut):
+    root = tmp_path / "d"
+    shutil.copytree(reference[0], root)
+    manifest = root / "manifest.json"
+    manifest.write_bytes(manifest.read_bytes()[:cut])
+    (root / "data" / "shard-00003.h5").write_bytes(b"\x89HDF")
+    lines = []
+    generate(n=7, out=root, report=lines.append, **SMALL)
+    assert "manifest.json is damaged; making the dataset again." in lines
+    assert tree(root) == reference[2]
+
+
+def test_a_cut_manifest_over_other_data_is_refused(reference, tmp_path):
+    root = tmp_path / "d"
+    shutil.copytree(reference[0], root)
+    (root / "manifest.json").write_bytes(b"{")
+    before = tree(root)
+    with pytest.raises(CorruptDataError, match="not valid JSON"):
+        generate(**{**SMALL, "n": 7, "out": root, "seed": 6})
+    assert tree(root) == before
 
 
 def test_leftovers_of_a_killed_run_disappear(reference, tmp_path):

@@ -1,0 +1,197 @@
+"""Prove a dataset by making some of it again."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from navrep_data.errors import ConfigError, DatasetError
+from navrep_data.generate.policy import PolicySpec, make_rollout
+from navrep_data.generate.worker import DatasetSpec, new_writer
+from navrep_data.schema import SCAN_SCALE
+from navrep_data.shards import DatasetFolder, Manifest, ShardEntry, sequence_hash
+from navrep_data.sim import RolloutSettings, ScriptedPolicy, SimConfig
+
+# Another CPU or library may round differently: up to this much is called equal, and counted [m, m/s, rad].
+TOLERANCE = 1e-3
+EQUAL_BYTES, EQUAL_COLUMNS, WITHIN, DIFFERENT = "equal bytes", "equal columns", "equal within 1 mm", "different"
+
+
+@dataclass(frozen=True)
+class SequenceComparison:
+    """How one sequence compares with itself made again.
+
+    Attributes
+    ----------
+    sequence : int
+        Its index.
+    verdict : str
+        ``"equal bytes"``: also the compressed bytes; ``"equal columns"``: every decoded value; ``"equal within 1 mm"``;
+        ``"different"``.
+    values : int
+        Values that differ.
+    largest : float
+        Largest difference (scans in metres, others in the column's unit).
+    columns : dict of str to int
+        Differing values by column.
+    """
+
+    sequence: int
+    verdict: str
+    values: int = 0
+    largest: float = 0.0
+    columns: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RegenerateReport:
+    """What :func:`regenerate` found.
+
+    Attributes
+    ----------
+    comparisons : list of SequenceComparison
+        One per sequence, in order.
+    """
+
+    comparisons: list[SequenceComparison]
+
+    @property
+    def ok(self) -> bool:
+        """Whether no sequence is different."""
+        return all(c.verdict != DIFFERENT for c in self.comparisons)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON values."""
+        return {"ok": self.ok, "sequences": [asdict(c) for c in self.comparisons]}
+
+
+def recipe_of(root: Path, manifest: Manifest) -> DatasetSpec:
+    """Return what makes a dataset, from its manifest alone.
+
+    Raises
+    ------
+    DatasetError
+        If it was not generated (an import, for example).
+    ConfigError, PolicyError
+        If this version cannot simulate it, or its policy cannot be imported.
+    """
+    if "name" not in manifest.policy or "env" not in manifest.config:
+        raise DatasetError(f"{root} was not made by `navrep-data generate`; there is no recipe to make it again from.")
+    config = SimConfig.from_dict(manifest.config)
+    settings = RolloutSettings(
+        manifest.length, manifest.scan_dtype, "rings" in manifest.columns, "humans" in manifest.columns
+    )
+    name = str(manifest.policy["name"])
+    policy = PolicySpec(name, int(manifest.policy.get("batch", 1)))
+    if policy.scripted and policy.to_dict() != manifest.policy:
+        raise ConfigError(
+            f"{root} was made with policy settings {manifest.policy}, this version has {ScriptedPolicy(name).to_dict()}; "
+            "use the version in its manifest."
+        )
+    return DatasetSpec(root, config, settings, policy, manifest.seed, manifest.columns)
+
+
+def regenerate(root: Path | str, k: int, seed: int | None = None) -> RegenerateReport:
+    """Simulate `k` random sequences of a dataset again from its manifest, and compare.
+
+    Parameters
+    ----------
+    root : path-like
+        Dataset folder.
+    k : int
+        Number of sequences; all of them if there are fewer.
+    seed : int, optional
+        Chooses the sequences; a new choice each time by default.
+
+    Returns
+    -------
+    RegenerateReport
+        Verdict per sequence.
+
+    Raises
+    ------
+    ConfigError
+        If `k` is not at least 1.
+    DatasetError, ConfigError, PolicyError
+        If the dataset cannot be made again.
+    CorruptDataError
+        If a shard is damaged.
+    """
+    root = Path(root)
+    if isinstance(k, bool) or not isinstance(k, int) or k < 1:
+        raise ConfigError(f"--regenerate is {k!r}, expected a whole number of at least 1.")
+    with DatasetFolder(root) as folder:
+        manifest = folder.manifest
+        spec = recipe_of(root, manifest)
+        everything = [s for entry in manifest.shards for s in range(*entry.sequences)]
+        chosen = sorted(random.Random(seed).sample(everything, min(k, len(everything))))
+        rollout = make_rollout(spec.config, spec.settings, spec.policy, spec.seed)
+        comparisons = []
+        for sequence in chosen:
+            index, entry = _shard_of(manifest, sequence)
+            first = entry.sequences[0] + (sequence - entry.sequences[0]) // rollout.batch * rollout.batch
+            group = range(first, min(first + rollout.batch, entry.sequences[1]))
+            columns, worlds = rollout.run(group)[sequence - first]
+            comparisons.append(_compare(folder, spec, index, entry, sequence, columns, worlds))
+    return RegenerateReport(comparisons)
+
+
+def _shard_of(manifest: Manifest, sequence: int) -> tuple[int, ShardEntry]:
+    return next((i, e) for i, e in enumerate(manifest.shards) if e.sequences[0] <= sequence < e.sequences[1])
+
+
+def _compare(
+    folder: DatasetFolder, spec: DatasetSpec, index: int, entry: ShardEntry, sequence: int,
+    columns: dict[str, npt.NDArray[Any]], worlds: dict[str, npt.NDArray[Any]],
+) -> SequenceComparison:  # fmt: skip
+    length = spec.settings.length
+    start = (sequence - entry.sequences[0]) * length
+    counts: dict[str, int] = {}
+    largest = 0.0
+    for name in spec.columns:
+        old = folder.read(name, index, start, start + length)
+        new = columns[name]
+        same = (old == new) | ((old != old) & (new != new))
+        if not same.all():
+            counts[name] = int((~same).sum())
+            if name != "rings":  # steps, not lengths: a range that moves by nothing to speak of may change its cell
+                scale = SCAN_SCALE if old.dtype == np.uint16 else 1.0
+                size = np.abs(old[~same].astype(np.float64) - new[~same].astype(np.float64)) * scale
+                largest = max(largest, float(np.nan_to_num(size, nan=np.inf).max()))
+    if not counts:
+        listed = entry.sequence_hashes[sequence - entry.sequences[0]]
+        if sequence_hash({name: columns[name] for name in spec.columns}) != listed:
+            return SequenceComparison(sequence, DIFFERENT, columns={"sequence_hashes": 1})
+        same_bytes = _same_chunks(spec, entry, sequence, columns, worlds)
+        return SequenceComparison(sequence, EQUAL_BYTES if same_bytes else EQUAL_COLUMNS)
+    # the slack lets a difference of one millimetre pass in spite of its rounding; rings follow from the scan alone
+    hard = largest > TOLERANCE * (1 + 1e-6) or set(counts) == {"rings"}
+    return SequenceComparison(sequence, DIFFERENT if hard else WITHIN, sum(counts.values()), largest, counts)
+
+
+def _same_chunks(
+    spec: DatasetSpec, entry: ShardEntry, sequence: int, columns: dict[str, npt.NDArray[Any]],
+    worlds: dict[str, npt.NDArray[Any]],
+) -> bool:  # fmt: skip
+    """Return whether the compressed chunks of a sequence are the stored ones, byte for byte."""
+    writer = new_writer(spec, sequence)
+    writer.append(columns, worlds)
+    image = writer.finish().data
+    start = (sequence - entry.sequences[0]) * spec.settings.length
+    with h5py.File(spec.root / entry.file, "r") as old, h5py.File.in_memory(image) as new:
+        for name in spec.columns:
+            a, b = old[name].id, new[name].id
+            rows = new[name].chunks[0]
+            if start % rows or spec.settings.length % rows:
+                return False  # chunks hold rows of several sequences: equal columns is all that can be said
+            for row in range(0, spec.settings.length, rows):
+                rest = (0,) * (len(new[name].shape) - 1)
+                if a.read_direct_chunk((start + row, *rest)) != b.read_direct_chunk((row, *rest)):
+                    return False
+    return True
