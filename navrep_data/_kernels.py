@@ -24,7 +24,9 @@ from navrep_data.io import cache_dir
 def _cache_folder() -> str:
     digest = hashlib.sha256()
     package = Path(__file__).parent
-    for path in sorted(package.rglob("_*.py")):
+    # kernels, and the constants that they compile in
+    sources = [path for path in package.rglob("_*.py") if not path.name.startswith("__")]
+    for path in sorted([*sources, package / "schema.py"]):
         digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
     config: Any = numba.config  # untyped: its switches are set dynamically
     digest.update(repr((numba.__version__, config.BOUNDSCHECK, config.OPT, config.DEBUG_JIT)).encode())

@@ -1,0 +1,48 @@
+"""make_loader yields what a plain DataLoader yields."""
+
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from navrep_data.datasets import ScanDataset, SequenceDataset, make_loader
+from navrep_data.errors import ConfigError
+from navrep_data.testing import tiny_dataset
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return tiny_dataset(tmp_path_factory.mktemp("loading") / "d")
+
+
+@pytest.mark.parametrize(
+    "dataset_of", [lambda r: SequenceDataset(r, "rings", window=8), lambda r: ScanDataset(r, "1d")]
+)
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_batches_are_those_of_a_plain_loader(root, dataset_of, num_workers):
+    dataset = dataset_of(root)
+    plain = list(DataLoader(dataset, batch_size=5))
+    ours = list(make_loader(dataset, 5, shuffle=False, num_workers=num_workers))
+    assert len(plain) == len(ours) == -(-len(dataset) // 5)
+    for a, b in zip(plain, ours, strict=True):
+        assert a.keys() == b.keys()
+        for name in a:
+            assert torch.equal(a[name], b[name])
+
+
+def test_shuffling_is_seeded_and_new_each_epoch(root):
+    dataset = SequenceDataset(root, None, window=8)
+
+    def order(loader):
+        return torch.cat([batch["robot_state"][:, 0, 0] for batch in loader]).tolist()
+
+    loader = make_loader(dataset, 4, seed=1)
+    first, second = order(loader), order(loader)
+    assert first != second
+    assert sorted(first) == sorted(second)
+    assert order(make_loader(dataset, 4, seed=1)) == first
+    assert sum(len(b["mask"]) for b in make_loader(dataset, 4, drop_last=True)) == len(dataset) // 4 * 4
+
+
+def test_batch_size_is_checked(root):
+    with pytest.raises(ConfigError, match="batch_size is 0"):
+        make_loader(SequenceDataset(root, None), 0)
