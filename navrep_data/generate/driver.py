@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 import shutil
@@ -14,7 +15,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from navrep_data.errors import CorruptDataError, DatasetError
+from navrep_data.errors import CorruptDataError, DatasetError, NavrepDataError
 from navrep_data.generate.executors import LocalExecutor
 from navrep_data.generate.plan import (
     Request,
@@ -253,6 +254,7 @@ class _Run:
         self.began = time.perf_counter()
         self._saved_at = 0.0
         self._save_seconds = 0.0
+        self._unsaved = False
         if (self.root / MANIFEST_FILE).exists():
             self.manifest = self._resume(explicit_shard_size)
         else:
@@ -343,10 +345,16 @@ class _Run:
             smoothing=0.1,
             dynamic_ncols=True,
         ) as bar:
-            for finished in executor.run(tasks):
-                if finished is not None:
-                    self._add(*finished)
-                bar.update(done_rows + executor.rows_made - bar.n)
+            try:
+                for finished in executor.run(tasks):
+                    if finished is not None:
+                        self._add(*finished)
+                    self._save_if_due()
+                    bar.update(done_rows + executor.rows_made - bar.n)
+            except BaseException:
+                with contextlib.suppress(NavrepDataError):  # the disk may be full; the manifest in place is a good one
+                    self._save()
+                raise
         self._finish()
 
     def _announce(self, done_rows: int, workers: int) -> None:
@@ -373,9 +381,8 @@ class _Run:
             self._replace(task, entry)
         self._entries[task.first, task.stop] = entry
         self.new_rows += entry.rows
-        if task.staged or time.monotonic() - self._saved_at > max(
-            MANIFEST_SECONDS, self._save_seconds / MANIFEST_SHARE
-        ):
+        self._unsaved = True
+        if task.staged:
             self._save()
 
     def _replace(self, task: ShardTask, entry: ShardEntry) -> None:
@@ -387,9 +394,16 @@ class _Run:
             if part is not None:
                 os.replace(self.root / STAGING / part.file, self.root / part.file)
 
+    def _save_if_due(self) -> None:
+        """List what is finished, unless that was done a moment ago."""
+        pause = max(MANIFEST_SECONDS, self._save_seconds / MANIFEST_SHARE)
+        if self._unsaved and time.monotonic() - self._saved_at > pause:
+            self._save()
+
     def _save(self) -> None:
         begun = time.monotonic()
         self.manifest = self.manifest.with_shards(self._entries.values(), complete=False).save(self.root)
+        self._unsaved = False
         self._saved_at = time.monotonic()
         self._save_seconds = self._saved_at - begun
 

@@ -91,8 +91,8 @@ def recipe_of(root: Path, manifest: Manifest) -> DatasetSpec:
     policy = PolicySpec(name, int(manifest.policy.get("batch", 1)))
     if policy.scripted and policy.to_dict() != manifest.policy:
         raise ConfigError(
-            f"{root} was made with policy settings {manifest.policy}, this version has {ScriptedPolicy(name).to_dict()}; "
-            "use the version in its manifest."
+            f"{root} was made with policy settings {manifest.policy}, this version has "
+            f"{ScriptedPolicy(name).to_dict()}; use the version in its manifest."
         )
     return DatasetSpec(root, config, settings, policy, manifest.seed, manifest.columns)
 
