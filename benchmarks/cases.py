@@ -36,8 +36,8 @@ class Effort:
         Turns.
     seconds : float
         Least time of one figure in one turn [s].
-    sequences : int
-        Sequences of 1000 rows that the data set of the windows has.
+    core, sequences : int
+        Sequences of 1000 rows of a run with one worker, and of the dataset of the windows.
     big, small : int
         Sequences of the large and of the small ``generate`` run.
     turns : int
@@ -46,13 +46,14 @@ class Effort:
 
     repeats: int = 5
     seconds: float = 1.5
+    core: int = 40
     sequences: int = 100
     big: int = 1000
     small: int = 100
     turns: int = 2
 
 
-QUICK = Effort(repeats=3, seconds=0.4, sequences=20, big=100, small=40, turns=1)
+QUICK = Effort(repeats=3, seconds=0.4, core=20, sequences=20, big=100, small=40, turns=1)
 
 
 def rate_row(key: str, ours: Timing, other: Timing, reference: str, note: str = "", judge: str = "cpu") -> Row:
@@ -94,7 +95,7 @@ def plain_row(key: str, values: Sequence[float], reference: str, others: Sequenc
 
 
 def simulate(effort: Effort) -> list[Row]:
-    """Measure steps per second of the simulator, rows in memory, beside RVO2's own step for a crowd of the same worlds."""
+    """Measure steps per second of the simulator, rows in memory, beside RVO2's own step in the same worlds."""
     from navrep_data.sim import RolloutSettings, ScriptedPolicy, ScriptedRollout, make_config
 
     def rollout(rings: bool) -> Callable[[], float]:
@@ -203,12 +204,12 @@ def rings(effort: Effort) -> list[Row]:
     return [rate_row("rings", a, b, "the original's loops, by numba", "scan_to_rings of uint16 scans")]
 
 
-def sequence_of_rows(sequence: int = 0) -> dict[str, np.ndarray]:
-    """Return the columns of one soadrl sequence."""
+def sequence_of_rows(scan_dtype: str = "uint16") -> dict[str, np.ndarray]:
+    """Return the columns of one soadrl sequence; scans in millimetres, or in metres for float32."""
     from navrep_data.sim import RolloutSettings, ScriptedPolicy, ScriptedRollout, make_config
 
-    rollout = ScriptedRollout(make_config("soadrl"), RolloutSettings(LENGTH), ScriptedPolicy(), 0)
-    ((columns, _),) = rollout.run([sequence])
+    rollout = ScriptedRollout(make_config("soadrl"), RolloutSettings(LENGTH, scan_dtype), ScriptedPolicy(), 0)
+    ((columns, _),) = rollout.run([0])
     return {name: values.copy() for name, values in columns.items()}
 
 
@@ -218,21 +219,20 @@ def generate_core(effort: Effort) -> list[Row]:
 
     from navrep_data.generate import generate
 
-    columns = sequence_of_rows()
-    sequences = 10 if effort.repeats < QUICK.repeats + 1 else 40
+    columns = sequence_of_rows("float32")
     with tempfile.TemporaryDirectory() as folder:
         numbers = itertools.count()
 
         def ours() -> float:
             out = Path(folder) / str(next(numbers))
-            return float(generate("soadrl", sequences, out, workers=1).new_rows)
+            return float(generate("soadrl", effort.core, out, workers=1).new_rows)
 
         def npz() -> float:
             (Path(folder) / "rows.npz").write_bytes(original_npz(columns))
             return LENGTH
 
         a, b = in_turns([ours, npz], effort.repeats, effort.seconds)
-    note = f"n={sequences}, all columns, hashed, manifest; compile excluded; the slower of CPU and wall"
+    note = f"n={effort.core}, all columns, hashed, manifest; compile excluded; the slower of CPU and wall"
     return [rate_row("generate-core", a, b, "np.savez_compressed, writing alone", note, "slower")]
 
 
@@ -261,14 +261,19 @@ def sizes(root: Path) -> list[Row]:
             rows += len(file["scan"])
     with h5py.File(root / manifest.shards[0].file) as file:
         chunk = file["scan"].chunks[0]
-        columns = {name: file[name][:LENGTH] for name in ("scan", "robot_state", "action", "reward", "is_last")}
-    best = zlib_bytes(columns["scan"], chunk) / LENGTH
-    npz = len(original_npz(columns)) / LENGTH
+        best = zlib_bytes(file["scan"][:LENGTH], chunk) / LENGTH
+    npz = len(original_npz(sequence_of_rows("float32"))) / LENGTH
     whole = sum(path.stat().st_size for path in root.rglob("*") if path.is_file())
     note = f"{rows:,} rows"
     return [
         plain_row("scan-bytes", [stored / rows], "shuffle + zlib level 9", [best], note),
-        plain_row("row-bytes", [whole / rows], "original's npz (no rings, no humans)", [npz], note + ", whole folder"),
+        plain_row(
+            "row-bytes",
+            [whole / rows],
+            "original's npz (float32 scans, no rings, no humans)",
+            [npz],
+            note + ", whole folder",
+        ),
     ]
 
 
@@ -322,7 +327,7 @@ CASES: dict[str, Callable[[Effort], list[Row]]] = {
 
 
 def generate_wall(effort: Effort) -> list[Row]:
-    """Measure wall time and memory of the command itself, beside the same command with one worker, and with little to do."""
+    """Measure wall time and memory of the command, beside one worker and beside little to do."""
     workers = min(2, cores())
     few = 20 * workers  # one shard for each
     big, one, small = [], [], []
@@ -337,7 +342,9 @@ def generate_wall(effort: Effort) -> list[Row]:
     rates = [effort.big * LENGTH / run.wall for run in big]
     others = [effort.small * LENGTH / run.wall for run in one]
     wall = plain_row("generate-wall", [run.wall * scale for run in big], "1 worker", [1e6 / rate for rate in others])
-    wall["note"] = f"{workers} workers, {spread(rates)['median']:,.0f} rows/s; reference: n={effort.small}, scaled"
+    cpu = spread([run.cpu / effort.big for run in big])["median"]  # per 1000 rows, of all processes
+    wall["note"] = f"{workers} workers, {spread(rates)['median']:,.0f} rows/s, {1000 * cpu:.0f} CPU s per 1M rows"
+    wall["note"] += f"; reference: n={effort.small}, scaled"
     if effort.big != 1000:
         wall["note"] += f"; SCALED x{scale:g} FROM n={effort.big}, start-up too"
     memory = plain_row(
@@ -351,14 +358,14 @@ def generate_wall(effort: Effort) -> list[Row]:
 def _command(out: Path, n: int, workers: int) -> Any:
     shutil.rmtree(out, ignore_errors=True)
     run = run_tree([*GENERATE, "--n", str(n), "--workers", str(workers), "--out", out])
-    made = json.loads(run.stdout.strip().splitlines()[-1])
+    made = json.loads(run.stdout)
     if made["rows"] != n * LENGTH:
         raise RuntimeError(f"generate made {made['rows']} rows, expected {n * LENGTH}")
     return run
 
 
 def first_row(effort: Effort) -> list[Row]:
-    """Measure seconds from starting Python to the first row on disk, and in memory, beside importing what that needs."""
+    """Measure seconds from starting Python to the first row, beside importing what that needs."""
     in_memory = (
         "from navrep_data.sim import *;ScriptedRollout(make_config(), RolloutSettings(1), ScriptedPolicy(), 0).run([0])"
     )

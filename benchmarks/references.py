@@ -104,12 +104,11 @@ class Rvo2:
 
 
 def original_npz(columns: dict[str, NDArray[Any]]) -> bytes:
-    """Return rows as the original writes them: np.savez_compressed, float32 scans, float64 rest."""
+    """Return rows as the original writes them: np.savez_compressed, float32 scans [m], float64 rest."""
     memory = io.BytesIO()
-    scan = columns["scan"].astype(np.float32) / np.float32(1000)
     np.savez_compressed(
         memory,
-        scans=scan,
+        scans=columns["scan"],
         robotstates=columns["robot_state"].astype(np.float64),
         actions=columns["action"].astype(np.float64),
         rewards=columns["reward"].astype(np.float64),

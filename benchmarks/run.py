@@ -44,7 +44,7 @@ def collect(names: list[str], effort: Effort) -> list[Row]:
             continue
         try:
             rows += OUTSIDE[name](effort)
-        except (RuntimeError, OSError) as error:
+        except (RuntimeError, OSError, ValueError) as error:
             rows.append({"key": name, "error": str(error)})
     return rows
 

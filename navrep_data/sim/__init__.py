@@ -2,7 +2,7 @@
 
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
-from navrep_data.sim.registry import describe_environment, environment_names, make_config
+from navrep_data.sim.registry import describe_environment, environment_names, make_config, numpy_seed
 from navrep_data.sim.rollout import (
     CallableRollout,
     PolicyFunction,
@@ -27,5 +27,6 @@ __all__ = [
     "describe_environment",
     "environment_names",
     "make_config",
+    "numpy_seed",
     "warm_up",
 ]

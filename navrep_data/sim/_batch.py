@@ -5,7 +5,7 @@ import numpy as np
 
 from navrep_data._kernels import kernel
 from navrep_data.sim._layout import S_EPISODE
-from navrep_data.sim._rng import seed_philox
+from navrep_data.sim._rng import seed_mt, seed_philox
 from navrep_data.sim._step import observe_scan, observe_state, reset_world, step_world
 
 
@@ -19,14 +19,23 @@ def seed_worlds(rng, scalars, seed, first_sequence):
 
 
 @kernel
+def seed_legacy(rng, seeds, mask):
+    """Give the worlds of `mask` the streams of ``numpy.random.RandomState(seeds[w])``."""
+    for w in range(rng.shape[0]):
+        if mask[w]:
+            seed_mt(rng[w], seeds[w])
+
+
+@kernel
 def reset_worlds(
-    mask, agents, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags
+    mask, agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags,
+    orca_params, work_f, work_i, moves,
 ):  # fmt: skip
     """Start the next episode in the worlds of `mask`; returns False if one could not be made."""
     for w in range(agents.shape[0]):
         if mask[w] and not reset_world(
-            agents[w], scalars[w], vertices[w], polygon_start[w], edges[w], obst_f[w], obst_i[w], boxes, rng[w],
-            params, flags,
+            agents[w], agents32, scalars[w], vertices[w], polygon_start[w], edges[w], obst_f[w], obst_i[w], boxes[w],
+            rng[w], params, flags, orca_params, work_f, work_i, moves,
         ):  # fmt: skip
             return False
     return True
@@ -34,15 +43,15 @@ def reset_worlds(
 
 @kernel
 def step_worlds(
-    actions, agents, agents32, scalars, edges, polygon_start, obst_f, obst_i, params, orca_params, work_f, work_i,
-    moves, rewards, events,
+    actions, agents, agents32, scalars, edges, polygon_start, boxes, obst_f, obst_i, params, flags, orca_params,
+    work_f, work_i, moves, rewards, events,
 ):  # fmt: skip
     """Advance all worlds by one step under actions (W, 3)."""
     result = np.zeros(2)
     for w in range(agents.shape[0]):
         step_world(
-            agents[w], agents32, scalars[w], edges[w], polygon_start[w], obst_f[w], obst_i[w], params, orca_params,
-            work_f, work_i, moves, actions[w, 0], actions[w, 1], actions[w, 2], result,
+            agents[w], agents32, scalars[w], edges[w], polygon_start[w], boxes[w], obst_f[w], obst_i[w], params, flags,
+            orca_params, work_f, work_i, moves, actions[w, 0], actions[w, 1], actions[w, 2], result,
         )  # fmt: skip
         rewards[w] = result[0]
         events[w] = np.uint8(result[1])

@@ -65,6 +65,15 @@ P_VPREF_LOW = 22
 P_VPREF_HIGH = 23
 PARAM_FIELDS = 24
 
+# --- boxes (P, BOX_FIELDS) float64, per world: what the recipe knows of each polygon but the border -------------------
+# consistent: centre x, y and half sides [m]. original: the cells of the collision grid that the obstacle fills
+B_X0 = 0  # first column
+B_X1 = 1  # one after the last column
+B_Y0 = 2
+B_Y1 = 3
+B_STEP = 4  # 2 where only even columns and rows are filled
+BOX_FIELDS = 5
+
 # --- flags (FLAG_FIELDS,) int64, one array per config ---------------------------------------------------------------
 F_ORIGINAL = 0  # 1: world recipe, rewards, collisions of the released software
 F_SQUARE_CROSSING = 1  # 1: humans cross a square (test), 0: a circle (train, val)

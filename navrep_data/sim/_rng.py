@@ -131,6 +131,12 @@ def seed_mt(rng, seed):
 
 
 @kernel
+def is_mersenne(rng):
+    """Return whether the stream is one of numpy's legacy generator."""
+    return rng[_KIND] == _KIND_MT
+
+
+@kernel
 def uniform(rng):
     """Return a float64 in [0, 1), as ``Generator.random`` or ``RandomState.random_sample`` do."""
     if rng[_KIND] == _KIND_MT:

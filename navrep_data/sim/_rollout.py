@@ -223,15 +223,16 @@ def finish_row(
         # what is stored is what was executed
         ax, ay, omega = np.float32(action[0]), np.float32(action[1]), np.float32(action[2])
         step_world(
-            agents, agents32, scalars, edges, polygon_start, obst_f, obst_i, params, orca_params, work_f, work_i,
-            moves, np.float64(ax), np.float64(ay), np.float64(omega), result,
+            agents, agents32, scalars, edges, polygon_start, boxes, obst_f, obst_i, params, flags, orca_params,
+            work_f, work_i, moves, np.float64(ax), np.float64(ay), np.float64(omega), result,
         )  # fmt: skip
         out_floats[row, 5], out_floats[row, 6], out_floats[row, 7] = ax, ay, omega
         out_floats[row, 8] = result[0]
         return int(result[1])
     if not last and not reset_world(
-        agents, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags
-    ):
+        agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags,
+        orca_params, work_f, work_i, moves,
+    ):  # fmt: skip
         return -1
     return NONE
 
@@ -253,7 +254,10 @@ def rollout_sequence(
     counts[:] = 0
     scalars[:] = 0.0
     scalars[S_EPISODE] = -1.0
-    if not reset_world(agents, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags):
+    if not reset_world(
+        agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags,
+        orca_params, work_f, work_i, moves,
+    ):  # fmt: skip
         return False
     pending = NONE
     for row in range(length):
@@ -300,7 +304,7 @@ def finish_rows(
     for w in range(agents.shape[0]):
         pending[w] = finish_row(
             row, length, pending[w], gave_up[w], actions[w], agents[w], agents32, scalars[w], vertices[w],
-            polygon_start[w], edges[w], obst_f[w], obst_i[w], boxes, rng[w], params, flags, orca_params,
+            polygon_start[w], edges[w], obst_f[w], obst_i[w], boxes[w], rng[w], params, flags, orca_params,
             work_f, work_i, moves, result, out_floats[w], out_ints[w],
         )  # fmt: skip
         if pending[w] < 0:

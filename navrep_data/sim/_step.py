@@ -21,8 +21,10 @@ from navrep_data.sim._layout import (
     A_Y,
     F_GAP_QUIRK,
     F_LEGS,
+    F_ORIGINAL,
     P_ANGLE_INCREMENT,
     P_ANGLE_MIN,
+    P_BORDER_GAP,
     P_DT,
     P_RANGE_MAX,
     S_EPISODE,
@@ -37,7 +39,9 @@ from navrep_data.sim._layout import (
 from navrep_data.sim._lidar import leg_circles, scan_world
 from navrep_data.sim._obstacles import build_obstacles
 from navrep_data.sim._orca import orca_velocity
-from navrep_data.sim._worlds import draw_world
+from navrep_data.sim._original import draw_original, judge_original, walk_original
+from navrep_data.sim._rng import is_mersenne
+from navrep_data.sim._worlds import add_border, draw_world
 
 # orca.py of the original: agents enter RVO2 with their radius plus 1 cm
 ORCA_MARGIN = 0.01
@@ -56,30 +60,6 @@ def fill_edges(vertices, polygon_start, n_polygons, edges):
             w = v + 1 if v < last else first
             edges[v, 0], edges[v, 1] = vertices[v, 0], vertices[v, 1]
             edges[v, 2], edges[v, 3] = vertices[w, 0], vertices[w, 1]
-
-
-@kernel
-def build_trees(vertices, polygon_start, scalars, obst_f, obst_i):
-    """Build the ORCA obstacle tree of a finished world; returns False where it does not fit."""
-    n = int(scalars[S_POLYGONS])
-    count = build_obstacles(vertices, polygon_start[: n + 1], obst_f[0], obst_i[0])
-    scalars[S_OBST_HUMAN] = count
-    scalars[S_OBST_ROBOT] = count
-    return count >= 0
-
-
-@kernel
-def reset_world(agents, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags):
-    """Draw the next episode of a world; returns False if no world fits the arrays."""
-    episode = scalars[S_EPISODE]
-    for _ in range(MAX_REDRAWS + 1):
-        scalars[:] = 0.0
-        scalars[S_EPISODE] = episode + 1.0
-        draw_world(agents, scalars, vertices, polygon_start, boxes, rng, params, flags)
-        if build_trees(vertices, polygon_start, scalars, obst_f, obst_i):
-            fill_edges(vertices, polygon_start, int(scalars[S_POLYGONS]), edges)
-            return True
-    return False
 
 
 @kernel
@@ -143,9 +123,78 @@ def move_humans(agents, n_humans, moves, dt):
 
 
 @kernel
+def build_trees(vertices, polygon_start, scalars, obst_f, obst_i):
+    """Build the ORCA obstacle tree of a finished world; returns False where it does not fit."""
+    n = int(scalars[S_POLYGONS])
+    count = build_obstacles(vertices, polygon_start[: n + 1], obst_f[0], obst_i[0])
+    scalars[S_OBST_HUMAN] = count
+    scalars[S_OBST_ROBOT] = count
+    return count >= 0
+
+
+@kernel
+def begin_original(
+    agents, agents32, scalars, vertices, polygon_start, obst_f, obst_i, params, orca_params, work_f, work_i, moves
+):  # fmt: skip
+    """Take the hidden first step of a drawn `original` world and close it; returns False where a tree does not fit.
+
+    The humans' tree is built before the border is there, so they do not know of it; the robot's tree has it.
+    """
+    n_polygons = int(scalars[S_POLYGONS])
+    scalars[S_OBST_HUMAN] = build_obstacles(vertices, polygon_start[: n_polygons + 1], obst_f[0], obst_i[0])
+    if scalars[S_OBST_HUMAN] < 0.0:
+        return False
+    n_humans = int(scalars[S_HUMANS])
+    choose_humans(agents, agents32, scalars, obst_f, obst_i, orca_params, work_f, work_i, moves)
+    walk_original(agents, n_humans, moves, params[P_DT])
+    scalars[S_TIME] = params[P_DT]
+    for i in range(1, n_humans + 1):
+        agents[i, A_GAIT_X], agents[i, A_GAIT_Y], agents[i, A_GAIT_T] = 0.0, 0.0, 0.0
+    n_polygons = add_border(agents, scalars, vertices, polygon_start, n_polygons, params[P_BORDER_GAP])
+    scalars[S_POLYGONS] = n_polygons
+    # the original lists the border's corners from the upper left; RVO2's tree depends on the order of the edges
+    first = polygon_start[n_polygons - 1]
+    for k in range(2):
+        corner = vertices[first + 3, k]
+        for v in range(first + 3, first, -1):
+            vertices[v, k] = vertices[v - 1, k]
+        vertices[first, k] = corner
+    scalars[S_OBST_ROBOT] = build_obstacles(vertices, polygon_start[: n_polygons + 1], obst_f[-1], obst_i[-1])
+    return scalars[S_OBST_ROBOT] >= 0.0
+
+
+@kernel
+def reset_world(
+    agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags,
+    orca_params, work_f, work_i, moves,
+):  # fmt: skip
+    """Draw the next episode of a world; returns False if no world fits the arrays."""
+    episode = scalars[S_EPISODE]
+    # a numpy-seeded stream stands for one episode: another draw would be another episode under the same number
+    draws = 1 if is_mersenne(rng) else MAX_REDRAWS + 1
+    for _ in range(draws):
+        scalars[:] = 0.0
+        scalars[S_EPISODE] = episode + 1.0
+        if flags[F_ORIGINAL]:
+            ready = draw_original(
+                agents, scalars, vertices, polygon_start, boxes, rng, params, flags
+            ) and begin_original(
+                agents, agents32, scalars, vertices, polygon_start, obst_f, obst_i, params, orca_params, work_f,
+                work_i, moves,
+            )  # fmt: skip
+        else:
+            draw_world(agents, scalars, vertices, polygon_start, boxes, rng, params, flags)
+            ready = build_trees(vertices, polygon_start, scalars, obst_f, obst_i)
+        if ready:
+            fill_edges(vertices, polygon_start, int(scalars[S_POLYGONS]), edges)
+            return True
+    return False
+
+
+@kernel
 def step_world(
-    agents, agents32, scalars, edges, polygon_start, obst_f, obst_i,
-    params, orca_params, work_f, work_i, moves, ax, ay, omega, result,
+    agents, agents32, scalars, edges, polygon_start, boxes, obst_f, obst_i,
+    params, flags, orca_params, work_f, work_i, moves, ax, ay, omega, result,
 ):  # fmt: skip
     """Advance a world by one step under the body command (ax, ay [m/s], omega [rad/s]); fills result (reward, event).
 
@@ -157,14 +206,21 @@ def step_world(
     c, s = np.cos(agents[0, A_HEADING]), np.sin(agents[0, A_HEADING])
     moves[0, 0] = c * ax - s * ay
     moves[0, 1] = s * ax + c * ay
-    judge(agents, scalars, edges, polygon_start, moves, params, result)
+    original = flags[F_ORIGINAL] != 0
+    if original:
+        judge_original(agents, scalars, boxes, moves, omega, params, result)
+    else:
+        judge(agents, scalars, edges, polygon_start, moves, params, result)
     agents[0, A_X] += moves[0, 0] * dt
     agents[0, A_Y] += moves[0, 1] * dt
     agents[0, A_VX] = moves[0, 0]
     agents[0, A_VY] = moves[0, 1]
     agents[0, A_HEADING] = (agents[0, A_HEADING] + omega * dt) % TWO_PI
-    move_humans(agents, int(scalars[S_HUMANS]), moves, dt)
-    scalars[S_OMEGA] = omega
+    if original:
+        walk_original(agents, int(scalars[S_HUMANS]), moves, dt)
+    else:
+        move_humans(agents, int(scalars[S_HUMANS]), moves, dt)
+        scalars[S_OMEGA] = omega  # the original observes 0
     scalars[S_TIME] += dt
     scalars[S_STEP] += 1.0
 
@@ -197,7 +253,7 @@ def fill_circles(agents, n_humans, legs, circles):
 def observe_scan(
     agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, out
 ):  # fmt: skip
-    """Fill out (n_rays,) float32 with the ranges from the robot's pose [m], and hits, the rays that end on each human."""
+    """Fill out (n_rays,) float32 with the ranges from the robot's pose [m], and hits with the rays on each human."""
     n = int(scalars[S_HUMANS])
     n_circles = fill_circles(agents, n, flags[F_LEGS] != 0, circles)
     scan_world(

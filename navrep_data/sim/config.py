@@ -14,7 +14,7 @@ from navrep_data.errors import ConfigError, did_you_mean
 from navrep_data.schema import SensorContract
 from navrep_data.sim import _layout as lay
 
-PHYSICS = ("consistent",)
+PHYSICS = ("consistent", "original")
 CROSSINGS = ("circle", "square")
 RENDERINGS = ("legs", "trunk")
 # 1.5 times this many humans stand in a ring of 4 to 11.5 m; more find no place, and the humans column grows with it.
@@ -33,6 +33,7 @@ class SimConfig:
         Name in the registry that this config came from.
     physics : str
         ``"consistent"``: one geometry for lidar, ORCA and collisions, rewards as in the paper.
+        ``"original"``: what the released software does, see docs/differences.md.
     crossing : str
         ``"circle"`` (training): humans cross a circle; ``"square"`` (test): a square.
     humans : int
@@ -42,7 +43,8 @@ class SimConfig:
     rendering : str
         What the lidar sees of a human: ``"legs"`` or ``"trunk"`` (a circle of its radius).
     polygon_scale : float
-        Factor on obstacle sizes; 1.25 as the original's lidar sees them in training, 1.0 in its test.
+        Factor on obstacle sizes; 1.25 as the original's lidar sees them in training, 1.0 in its test. In `original`
+        physics it applies to what lidar and ORCA see, never to what the robot collides with.
     time_limit : float
         Longest episode [s].
     sensor : SensorContract
@@ -148,7 +150,8 @@ def kernel_params(config: SimConfig) -> NDArray[np.float64]:
     p[lay.P_REWARD_GOAL] = 100.0
     p[lay.P_REWARD_COLLISION] = -25.0
     p[lay.P_REWARD_DANGER] = -1.0
-    p[lay.P_REWARD_PROGRESS] = 1.0
+    # per metre; navreptrainenv.py pays a tenth of the paper's
+    p[lay.P_REWARD_PROGRESS] = 0.1 if config.physics == "original" else 1.0
     p[lay.P_ANGLE_MIN] = config.sensor.angle_min
     p[lay.P_ANGLE_INCREMENT] = config.sensor.angle_increment
     p[lay.P_RANGE_MAX] = config.sensor.range_max
@@ -162,6 +165,7 @@ def kernel_flags(config: SimConfig) -> NDArray[np.int64]:
     f = np.zeros(lay.FLAG_FIELDS, np.int64)
     f[lay.F_SQUARE_CROSSING] = config.crossing == "square"
     f[lay.F_LEGS] = config.rendering == "legs"
+    f[lay.F_ORIGINAL] = f[lay.F_GAP_QUIRK] = config.physics == "original"
     return f
 
 

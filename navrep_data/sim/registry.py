@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from navrep_data.errors import UnknownNameError, did_you_mean
+import numpy as np
+
+from navrep_data.errors import ConfigError, UnknownNameError, did_you_mean
 from navrep_data.sim.config import SimConfig
 
 _ENVIRONMENTS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -12,7 +14,22 @@ _ENVIRONMENTS: dict[str, tuple[str, dict[str, Any]]] = {
         "the dataset variant of the training environment: procedural polygons, about 20 ORCA humans on a circle",
         {"crossing": "circle", "humans": 20, "obstacles": 10, "polygon_scale": 1.25},
     ),
+    "navrep-train": (
+        "the training environment at its greatest difficulty: procedural polygons, about 5 ORCA humans on a circle",
+        {"crossing": "circle", "humans": 5, "obstacles": 10, "polygon_scale": 1.25},
+    ),
+    "navrep-val": (
+        "as navrep-train, with 50 numbered episodes",
+        {"crossing": "circle", "humans": 5, "obstacles": 10, "polygon_scale": 1.25},
+    ),
+    "navrep-test": (
+        "the training environment's test: humans cross a square, polygons at true size, 500 numbered episodes",
+        {"crossing": "square", "humans": 5, "obstacles": 10, "polygon_scale": 1.0},
+    ),
 }
+
+# crowd_sim.py: numpy is seeded with an offset plus the case counter, which wraps at the phase's size
+_NUMBERED: dict[str, tuple[int, int]] = {"navrep-val": (0, 50), "navrep-test": (1000, 500)}
 
 
 def environment_names() -> list[str]:
@@ -23,6 +40,32 @@ def environment_names() -> list[str]:
 def describe_environment(name: str) -> str:
     """Return one line on what an environment is."""
     return _lookup(name)[0]
+
+
+def numpy_seed(env: str, episode: int) -> int:
+    """Return the numpy seed of an environment's numbered episode, for :meth:`Simulator.reset_seeded`.
+
+    Parameters
+    ----------
+    env : str
+        ``"navrep-test"`` (500 episodes, seeds from 1000) or ``"navrep-val"`` (50 episodes, seeds from 0).
+    episode : int
+        Number of the episode; beyond the last it starts again, as in the original.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such environment.
+    ConfigError
+        If the environment has no numbered episodes, or `episode` is no whole number from 0.
+    """
+    _lookup(env)
+    if env not in _NUMBERED:
+        raise ConfigError(f"Environment {env!r} has no numbered episodes; those that do: {', '.join(_NUMBERED)}.")
+    if isinstance(episode, bool) or not isinstance(episode, (int, np.integer)) or episode < 0:
+        raise ConfigError(f"episode is {episode!r}, expected a whole number from 0.")
+    first, count = _NUMBERED[env]
+    return first + int(episode) % count
 
 
 def _lookup(name: str) -> tuple[str, dict[str, Any]]:

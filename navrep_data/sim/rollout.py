@@ -17,7 +17,7 @@ from navrep_data.sim._batch import reset_worlds, seed_worlds
 from navrep_data.sim._rollout import begin_rows, finish_rows, rollout_sequence
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
-from navrep_data.sim.simulator import WorldArrays, check_seed
+from navrep_data.sim.simulator import WorldArrays, check_seed, no_world
 
 PolicyFunction = Callable[[NDArray[np.float32], NDArray[np.float32]], Any]
 """``policy(scan (B, rays) [m], robot_state (B, 5)) -> action (B, 2) or (B, 3)``, body velocities."""
@@ -159,7 +159,7 @@ class ScriptedRollout:
         seed_worlds(a.rng, a.scalars, self.seed, sequence)
         ok = rollout_sequence(
             a.agents[0], a.agents32, a.scalars[0], a.vertices[0], a.polygon_start[0], a.edges[0], a.obst_f[0],
-            a.obst_i[0], a.boxes, a.rng[0], a.circles, a.dirs, a.inv_work, a.owner_work, a.hits[0], a.scans[0],
+            a.obst_i[0], a.boxes[0], a.rng[0], a.circles, a.dirs, a.inv_work, a.owner_work, a.hits[0], a.scans[0],
             a.work_f, a.work_i, a.moves, a.params, a.flags, a.orca_params,
             out.scan[0], out.floats[0], out.ints[0], out.humans[0], out.episodes[0], out.corners[0], out.sizes[0],
             out.table[0], out.counts[0],
@@ -207,8 +207,8 @@ class CallableRollout:
         out.counts[:] = 0
         everything = np.ones(n, np.bool_)
         if not reset_worlds(
-            everything, a.agents, a.scalars, a.vertices, a.polygon_start, a.edges, a.obst_f, a.obst_i, a.boxes,
-            a.rng, a.params, a.flags,
+            everything, a.agents, a.agents32, a.scalars, a.vertices, a.polygon_start, a.edges, a.obst_f, a.obst_i,
+            a.boxes, a.rng, a.params, a.flags, a.orca_params, a.work_f, a.work_i, a.moves,
         ):  # fmt: skip
             raise _no_world(a.config, sequences[0])
         pending = np.zeros(n, np.int64)
@@ -245,7 +245,8 @@ class CallableRollout:
             actions = np.concatenate([actions, np.zeros((n, 1))], axis=1)
         if actions.shape != (n, ACTION_SIZE):
             raise PolicyError(
-                f"The policy returned shape {actions.shape}, expected ({n}, 3) or ({n}, 2): vx, vy [m/s], omega [rad/s]."
+                f"The policy returned shape {actions.shape}, expected ({n}, 3) or ({n}, 2): "
+                "vx, vy [m/s], omega [rad/s]."
             )
         if not np.isfinite(actions).all():
             raise PolicyError("The policy returned NaN or infinity, expected finite velocities [m/s, m/s, rad/s].")
@@ -263,7 +264,4 @@ def _prepare(arrays: WorldArrays, settings: RolloutSettings) -> None:
 
 
 def _no_world(config: SimConfig, sequence: int) -> SimulationError:
-    return SimulationError(
-        f"No world for sequence {sequence} fits {lay.MAX_OBSTACLE_EDGES} obstacle edges with "
-        f"obstacles={config.obstacles}; ask for fewer obstacles."
-    )
+    return no_world(config, f"for sequence {sequence} ")

@@ -23,6 +23,7 @@ F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 
 MAX_SEED = 2**63 - 1
+MAX_NUMPY_SEED = 2**32 - 1
 
 
 def check_seed(seed: int) -> int:
@@ -30,6 +31,14 @@ def check_seed(seed: int) -> int:
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed <= MAX_SEED:
         raise ConfigError(f"seed is {seed!r}, expected a whole number from 0 to {MAX_SEED}.")
     return int(seed)
+
+
+def no_world(config: SimConfig, which: str = "") -> SimulationError:
+    """Return the error for a world that could not be drawn."""
+    return SimulationError(
+        f"No world {which}with humans={config.humans}, obstacles={config.obstacles} could be drawn: no free place, "
+        f"or more than {lay.MAX_OBSTACLE_EDGES} obstacle edges; ask for fewer of both."
+    )
 
 
 class WorldArrays:
@@ -52,14 +61,16 @@ class WorldArrays:
         self.vertices = np.zeros((n, corners, 2))
         self.polygon_start = np.zeros((n, polygons + 1), np.int64)
         self.edges = np.zeros((n, corners, 4))
-        self.obst_f = np.zeros((n, 1, OF_FIELDS, lay.MAX_OBSTACLE_EDGES), np.float32)
-        self.obst_i = np.zeros((n, 1, OI_FIELDS, lay.MAX_OBSTACLE_EDGES), np.int32)
+        self.boxes = np.zeros((n, polygons, lay.BOX_FIELDS))
+        # the obstacles that the humans know (first) and those that the robot knows (last)
+        trees = 2 if config.physics == "original" else 1
+        self.obst_f = np.zeros((n, trees, OF_FIELDS, lay.MAX_OBSTACLE_EDGES), np.float32)
+        self.obst_i = np.zeros((n, trees, OI_FIELDS, lay.MAX_OBSTACLE_EDGES), np.int32)
         self.rng = np.zeros((n, lay.RNG_WORDS), np.uint64)
         self.hits = np.zeros((n, max(1, config.max_humans)), np.int32)
         self.scans = np.zeros((n, rays), np.float32)
         # scratch, shared by all worlds
         self.agents32 = np.zeros((agents, 6), np.float32)
-        self.boxes = np.zeros((polygons, 4))
         self.circles = np.zeros((2 * agents, 4))
         self.inv_work = np.zeros(rays)
         self.owner_work = np.zeros(rays, np.int32)
@@ -128,19 +139,54 @@ class Simulator:
 
     def reset(self, mask: ArrayLike | None = None) -> None:
         """Start the next episode, in all worlds or in those where `mask` (W,) is True."""
-        a = self.arrays
+        self._reset(self._mask(mask), self.arrays.rng)
+
+    def reset_seeded(self, numpy_seeds: ArrayLike, mask: ArrayLike | None = None) -> None:
+        """Start episodes drawn from numpy's legacy generator, in all worlds or in those of `mask` (W,).
+
+        In `original` physics the world of ``numpy_seeds[w]`` is the one that the original software makes after
+        ``numpy.random.seed(numpy_seeds[w])``; see :func:`navrep_data.sim.numpy_seed` for its numbered episodes. The
+        worlds' own streams stay where they are, so a later :meth:`reset` draws what it would have drawn anyway.
+
+        Parameters
+        ----------
+        numpy_seeds : array_like of shape (W,)
+            Whole numbers from 0 to 2^32 - 1; those outside `mask` are not used.
+        mask : array_like of shape (W,), optional
+            Which worlds.
+
+        Raises
+        ------
+        ConfigError
+            If a shape or a seed is wrong.
+        SimulationError
+            If a world could not be drawn.
+        """
+        chosen = self._mask(mask)
+        seeds = np.asarray(numpy_seeds)
+        if seeds.shape != (self.n_worlds,) or seeds.dtype.kind not in "iu":
+            raise ConfigError(
+                f"numpy_seeds have shape {seeds.shape}, dtype {seeds.dtype}, expected ({self.n_worlds},) whole numbers."
+            )
+        if (seeds[chosen] < 0).any() or (seeds[chosen] > MAX_NUMPY_SEED).any():
+            raise ConfigError(f"numpy_seeds are {seeds.tolist()}, expected whole numbers from 0 to {MAX_NUMPY_SEED}.")
+        streams = np.zeros_like(self.arrays.rng)
+        _batch.seed_legacy(streams, np.where(chosen, seeds, 0).astype(np.uint64), chosen)
+        self._reset(chosen, streams)
+
+    def _mask(self, mask: ArrayLike | None) -> NDArray[np.bool_]:
         chosen = np.ones(self.n_worlds, np.bool_) if mask is None else np.asarray(mask, np.bool_)
         if chosen.shape != (self.n_worlds,):
             raise ConfigError(f"mask has shape {chosen.shape}, expected ({self.n_worlds},).")
-        ok = _batch.reset_worlds(
-            chosen, a.agents, a.scalars, a.vertices, a.polygon_start, a.edges, a.obst_f, a.obst_i, a.boxes, a.rng,
-            a.params, a.flags,
-        )  # fmt: skip
-        if not ok:
-            raise SimulationError(
-                f"No world with obstacles={self.config.obstacles} fits {lay.MAX_OBSTACLE_EDGES} obstacle edges; "
-                "ask for fewer obstacles."
-            )
+        return chosen
+
+    def _reset(self, chosen: NDArray[np.bool_], streams: NDArray[np.uint64]) -> None:
+        a = self.arrays
+        if not _batch.reset_worlds(
+            chosen, a.agents, a.agents32, a.scalars, a.vertices, a.polygon_start, a.edges, a.obst_f, a.obst_i, a.boxes,
+            streams, a.params, a.flags, a.orca_params, a.work_f, a.work_i, a.moves,
+        ):  # fmt: skip
+            raise no_world(self.config)
 
     def step(self, actions: ArrayLike) -> tuple[F64, NDArray[np.uint8]]:
         """Advance all worlds by one time step.
@@ -166,8 +212,8 @@ class Simulator:
         rewards = np.zeros(self.n_worlds)
         events = np.zeros(self.n_worlds, np.uint8)
         _batch.step_worlds(
-            commands, a.agents, a.agents32, a.scalars, a.edges, a.polygon_start, a.obst_f, a.obst_i, a.params,
-            a.orca_params, a.work_f, a.work_i, a.moves, rewards, events,
+            commands, a.agents, a.agents32, a.scalars, a.edges, a.polygon_start, a.boxes, a.obst_f, a.obst_i, a.params,
+            a.flags, a.orca_params, a.work_f, a.work_i, a.moves, rewards, events,
         )  # fmt: skip
         return rewards, events
 
@@ -198,7 +244,8 @@ class Simulator:
     def clearance(self, points: ArrayLike, world: int = 0) -> F64:
         """Return how far points (N, 2) are from solid static matter [m], world frame; negative inside it.
 
-        A robot of radius r at a point is free of obstacles where this is at least r.
+        In `consistent` physics a robot of radius r at a point is free of obstacles where this is at least r. In
+        `original` physics this is what the lidar sees; collisions are decided by a grid.
         """
         a = self.arrays
         n = int(a.scalars[world, lay.S_POLYGONS])
