@@ -46,7 +46,7 @@ test-boundscheck: $(STAMP)  ## Run the kernel tests with every array index check
 
 coverage: $(STAMP)  ## Line coverage of sim and observations, measured on plain Python.
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) --cov=navrep_data.sim --cov=navrep_data.observations \
-	  --cov-report=term-missing:skip-covered --cov-fail-under=95 $(PYTEST_ARGS)
+	  --cov-report=term --cov-fail-under=95 $(PYTEST_ARGS)
 
 kill-test: $(STAMP)  ## 200 random SIGKILLs of generate (CI runs 10).
 	NAVREP_DATA_KILLS=200 $(BIN)/python -m pytest -m slow tests/generate/test_kill.py -s

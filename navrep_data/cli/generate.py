@@ -32,7 +32,12 @@ def generate_command(
     workers: Annotated[int | None, typer.Option("--workers", help="Processes.", show_default="number of cores")] = None,
     length: Annotated[int, typer.Option("--length", help="Rows per sequence (0.2 s each).")] = 1000,
     physics: Annotated[
-        str | None, typer.Option("--physics", help="How worlds behave.", show_default="consistent")
+        str | None,
+        typer.Option(
+            "--physics",
+            help="consistent (one geometry), or original (as NavRep was released).",
+            show_default="consistent",
+        ),
     ] = None,
     humans: Annotated[
         int | None,
