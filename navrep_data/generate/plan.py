@@ -115,7 +115,7 @@ def versions() -> dict[str, str]:
     """Return the versions that the bytes of a dataset depend on; no time, host or speed."""
     import llvmlite.binding as llvm
 
-    names = ("numpy", "numba", "llvmlite", "h5py", "isal")
+    names = ("numpy", "numba", "llvmlite", "h5py", "deflate")
     return {
         "navrep_data": __version__,
         "python": f"{sys.version_info.major}.{sys.version_info.minor}",
