@@ -10,7 +10,20 @@ from types import ModuleType
 
 from navrep_data._version import __version__
 
-__all__ = ["__version__", "datasets", "errors", "generate", "io", "observations", "schema", "shards", "sim", "testing"]
+__all__ = [
+    "__version__",
+    "datasets",
+    "errors",
+    "generate",
+    "io",
+    "models",
+    "observations",
+    "schema",
+    "shards",
+    "sim",
+    "testing",
+    "zoo",
+]
 
 
 def __getattr__(name: str) -> ModuleType:

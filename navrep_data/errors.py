@@ -66,12 +66,28 @@ class PolicyError(NavrepDataError, ValueError):
     """A policy cannot be loaded, or returned something that is not a batch of actions."""
 
 
+class CheckpointError(NavrepDataError, ValueError):
+    """A file of weights is not what it should be: wrong format, names, shapes, sizes or content."""
+
+
 class SimulationError(NavrepDataError, RuntimeError):
     """The simulator reached a state that it cannot go on from."""
 
 
 class WorkerDiedError(NavrepDataError, RuntimeError):
     """A worker process ended without a result."""
+
+
+class DownloadError(NavrepDataError, OSError):
+    """A file could not be brought here from the network."""
+
+
+class OfflineError(DownloadError):
+    """A file is not on this machine and the network is switched off."""
+
+
+class ModelNotFoundError(NavrepDataError, FileNotFoundError):
+    """A checkpoint's file is neither in the given folder nor in the cache, and no network was asked or has it."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -1,4 +1,4 @@
-"""Files: cache folder, atomic writes, hashing, bounded reading."""
+"""Files: cache folder, atomic writes, hashing, bounded reading, checked downloads."""
 
 from navrep_data.io._files import (
     PART_SUFFIX,
@@ -13,13 +13,18 @@ from navrep_data.io._files import (
     sha256_file,
     translate_os_error,
 )
+from navrep_data.io.download import FileId, download, git_blob_sha1, is_offline
 
 __all__ = [
     "PART_SUFFIX",
+    "FileId",
     "atomic_write_bytes",
     "atomic_write_json",
     "cache_dir",
+    "download",
     "fsync_dir",
+    "git_blob_sha1",
+    "is_offline",
     "json_bytes",
     "read_json",
     "safe_join",

@@ -8,6 +8,7 @@ Compiled loops use the kernels of ``navrep_data.observations._rings`` with the t
 
 from __future__ import annotations
 
+from navrep_data.observations.adapter import Lidar, ScanAdapter
 from navrep_data.observations.rings import RING_EDGES, rings_to_float, rings_to_scan, scan_to_rings
 from navrep_data.observations.scans import (
     metres_from_millimetres,
@@ -18,6 +19,8 @@ from navrep_data.observations.scans import (
 
 __all__ = [
     "RING_EDGES",
+    "Lidar",
+    "ScanAdapter",
     "metres_from_millimetres",
     "millimetres_from_metres",
     "rings_to_float",

@@ -1,0 +1,108 @@
+"""C: controllers on features, and the end-to-end networks.
+
+Notes
+-----
+Original: stable-baselines 2.10 PPO2 with MlpPolicy, and the policies of ``custom_policy.py``. The state-action value
+(q) that stable-baselines 2 keeps and never uses is kept too, so that every released number has its place.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from navrep_data.errors import ArrayError
+from navrep_data.models.config import OBSERVATION_SHAPES, ControllerConfig, EndToEndConfig
+from navrep_data.models.vae import FLAT_SIZE, as_images, convolutions
+from navrep_data.schema import ROBOT_STATE_SIZE
+
+N_ACTIONS = 2
+
+
+def _perceptron(n_inputs: int, n_hidden: int, activation: type[nn.Module]) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(n_inputs, n_hidden), activation(), nn.Linear(n_hidden, n_hidden), activation())
+
+
+class ActorCritic(nn.Module):
+    """Base of both networks: an actor, a critic, and what PPO needs beside them.
+
+    Parameters
+    ----------
+    n_inputs, n_hidden : int
+        Inputs of the perceptrons, and units per layer.
+    activation : type
+        ``nn.Tanh`` or ``nn.ReLU``.
+    """
+
+    def __init__(self, n_inputs: int, n_hidden: int, activation: type[nn.Module]) -> None:
+        super().__init__()
+        self.pi = _perceptron(n_inputs, n_hidden, activation)
+        self.vf = _perceptron(n_inputs, n_hidden, activation)
+        self.mean = nn.Linear(n_hidden, N_ACTIONS)
+        self.value = nn.Linear(n_hidden, 1)
+        self.q = nn.Linear(n_hidden, N_ACTIONS)
+        self.logstd = nn.Parameter(torch.zeros(N_ACTIONS))
+
+    def features(self, inputs: Tensor) -> Tensor:
+        """Return what the two perceptrons take; here the inputs themselves."""
+        return inputs
+
+    def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the mean action, unclipped, (B, 2) and the value (B,).
+
+        Notes
+        -----
+        Released means are in the hundreds: control is bang-bang once they are clipped to [-1, 1].
+        """
+        x = self.features(inputs)
+        return self.mean(self.pi(x)), self.value(self.vf(x)).squeeze(-1)
+
+
+class Controller(ActorCritic):
+    """C of the paper: features to action and value.
+
+    Parameters
+    ----------
+    config : ControllerConfig
+        Sizes.
+    """
+
+    def __init__(self, config: ControllerConfig) -> None:
+        super().__init__(config.n_inputs, config.n_hidden, nn.Tanh)
+        self.config = config
+
+
+class EndToEnd(ActorCritic):
+    """The end-to-end network: observation and robot state in one row of numbers, to action and value.
+
+    Parameters
+    ----------
+    config : EndToEndConfig
+        Representation and sizes.
+
+    Notes
+    -----
+    Inputs are (B, 1085): ranges in *metres* and robot state, or (B, 4101): rings in {0, 0.5, 1} with the nearest
+    cell as measured, and robot state.
+    """
+
+    def __init__(self, config: EndToEndConfig) -> None:
+        super().__init__(config.n_features + ROBOT_STATE_SIZE, config.n_hidden, nn.ReLU)
+        self.config = config
+        self.encoder = convolutions(config.lidar)
+        self.fc = nn.Linear(FLAT_SIZE, config.n_features)
+
+    def features(self, inputs: Tensor) -> Tensor:
+        """Return the numbers of the convolutions and the robot state, shape (B, n_features + 5)."""
+        shape = OBSERVATION_SHAPES[self.config.lidar]
+        n_obs = math.prod(shape)
+        if inputs.shape[-1] != n_obs + ROBOT_STATE_SIZE:
+            raise ArrayError(
+                f"inputs have shape {tuple(inputs.shape)}, expected (B, {n_obs + ROBOT_STATE_SIZE}): observation and "
+                "robot state in one row."
+            )
+        obs, robot_state = inputs[..., :n_obs].reshape(-1, *shape), inputs[..., n_obs:]
+        x = self.encoder(as_images(obs, self.config.lidar)).flatten(1)
+        return torch.cat([self.fc(x), robot_state], dim=-1)

@@ -1,0 +1,114 @@
+"""Every released checkpoint by name: list, fetch, check and load.
+
+Notes
+-----
+Listing and fetching are light; torch is imported when something is loaded.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from navrep_data.zoo import fetching as _fetching
+from navrep_data.zoo import registry as _registry
+from navrep_data.zoo.fetching import fetch
+from navrep_data.zoo.registry import Record, list_models
+from navrep_data.zoo.verification import Check, Report, verify
+
+__all__ = ["Check", "Record", "Report", "fetch", "list_models", "load", "load_sb3", "show", "verify"]
+
+
+def show(name: str) -> Record:
+    """Return what is known of a checkpoint, present or not.
+
+    Parameters
+    ----------
+    name : str
+        Full name such as ``transformer_1d_z.20201015``, or a variant.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such name, or it fits several runs.
+    """
+    return _registry.resolve(name)
+
+
+def load(
+    name: str,
+    source: str | os.PathLike[str] | None = None,
+    inference: str = "deterministic",
+    seed: int = 0,
+    **options: Any,
+) -> Any:
+    """Load a checkpoint and everything it needs, resolved and checked as one.
+
+    Parameters
+    ----------
+    name : str
+        Full name such as ``transformer_1d_z.released``, or a variant (then a line on stderr says whose weights it is).
+    source : path-like or str, optional
+        Folder, ``https://...`` or ``hf://user/name`` to look in before the cache and the authors' repository.
+        Default: ``NAVREP_RELEASED_DIR`` where it is set.
+    inference : str
+        ``"deterministic"``: no dropout, z = mu, memory starts at zero. ``"as_released"``: as the authors' software
+        runs them, with dropout, sampled z in the memory and a random start, under `seed`.
+    seed : int
+        Seed of ``"as_released"``.
+    **options
+        Passed on: ``dtype``, ``compile``, ``device``.
+
+    Returns
+    -------
+    navrep_data.zoo.policy.Policy or torch.nn.Module
+        A policy for names with features and for ``e2e_*``; otherwise a world model, a V or an M.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such name, or it fits several runs.
+    CorruptDataError, OfflineError, DownloadError
+        If a file is not what it must be, or cannot be had.
+    """
+    record = _registry.resolve(name)
+    where = _fetching.Source.of(source)
+    # all files first: a part that cannot be had is told before seconds are spent on torch
+    files = {r.name: _fetching.get_files(r, where) for r in _registry.with_parts(record)}
+    from navrep_data.zoo.assemble import build
+
+    built: dict[str, Any] = {}
+    for r in _registry.with_parts(record):
+        if r.name not in built:
+            parts = {role: built[part] for role, part in r.parts.items()}
+            built[r.name] = build(r.to_dict(), files[r.name], parts, inference=inference, seed=seed, **options)
+    return built[record.name]
+
+
+def load_sb3(name: str, source: str | os.PathLike[str] | None = None, env: Any = None, **options: Any) -> Any:
+    """Load a controller as a stable-baselines3 PPO with the same weights, ready to predict and to train on.
+
+    Parameters
+    ----------
+    name : str
+        Name of a policy.
+    source : path-like or str, optional
+        As for :func:`load`.
+    env : gymnasium.Env or VecEnv, optional
+        Environment to train in; without one the model only predicts.
+    **options
+        Passed on to ``stable_baselines3.PPO``.
+
+    Returns
+    -------
+    stable_baselines3.PPO
+        Its observations are the controller's features, or the raw vector of end-to-end policies.
+
+    Raises
+    ------
+    UnknownNameError, CorruptDataError, OfflineError, DownloadError
+        As :func:`load`.
+    """
+    from navrep_data.zoo.sb3 import to_sb3
+
+    return to_sb3(load(name, source), env=env, **options)

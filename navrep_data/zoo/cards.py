@@ -1,0 +1,289 @@
+"""Model cards, one per variant, made from the registry: ``python -m navrep_data.zoo.cards cards/models``.
+
+Notes
+-----
+The cards in the repository are committed; a test checks that they are what this module makes.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from navrep_data.zoo.names import OWN, RELEASED, RELEASED_RULE, default_tag
+from navrep_data.zoo.registry import Record, dependants, variants
+
+_ARCHITECTURES = {
+    "modular": "V and M trained one after the other: a variational autoencoder, then an LSTM with mixture outputs",
+    "joint": "V and M trained as one: a variational autoencoder with an LSTM of two layers",
+    "transformer": "V and M trained as one: a variational autoencoder with a causal transformer of 8 blocks",
+    "e2e": "one network from observation to action, no world model",
+}
+_FEATURES = {
+    "z": "the code z of the current scan",
+    "h": "the memory h of the world model",
+    "zh": "the code z of the current scan and the memory h of the world model",
+}
+_SCANS = {
+    "over_25": "scan / 25 m, not clipped, shape (1080,)",
+    "rings": "rings {0 free, 0.5 unknown, 1 occupied}, shape (64 angles, 64 ranges)",
+    "metres": "scan in metres as it is, shape (1080,)",
+}
+_FORMATS = {
+    "sb2-zip": "stable-baselines 2 zip (its pickled parts are never read)",
+    "torch-state-dict": "torch state dict (read with weights_only)",
+    "tf-json": "JSON of TensorFlow variables times 10,000",
+}
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join(lines + ["| " + " | ".join("-" if v is None else str(v) for v in row) + " |" for row in rows])
+
+
+def _summary(r: Record) -> str:
+    architecture = _ARCHITECTURES[r.architecture]
+    if r.kind in ("policy", "controller"):
+        reads = f"Controller on {_FEATURES[r.features]}, and the robot state. " if r.features else ""
+        kind = "World model" if r.features else "Network"
+        if r.variant == "e2e_1d_carch":
+            architecture = "a plain perceptron on the raw numbers"
+        return f"{reads}{kind}: {architecture}."
+    what = {"vae": "V alone", "memory": "M alone", "world_model": "World model"}[r.kind]
+    return f"{what}: {architecture}."
+
+
+def inputs(r: Record) -> list[tuple[str, str, str]]:
+    """Return name, shape and unit or meaning of what a checkpoint takes and gives."""
+    sensor = r.sensor
+    scan = (
+        f"{sensor['n_rays']} rays, ray 0 straight ahead, anticlockwise, {sensor['range_max']:g} m where nothing is hit"
+    )
+    state = ("`robot_state`", "(B, 5)", "goal x, goal y [m], vx, vy [m/s], omega [rad/s], robot frame")
+    if r.kind in ("policy", "controller"):
+        rows = [("`scan`", f"(B, {sensor['n_rays']}) [m]", scan)] if r.kind == "policy" else []
+        rows.append(state)
+        rows.append(("features", f"(B, {r.n_inputs})", _feature_order(r)))
+        rows.append(
+            ("action (out)", "(B, 3)", "vx, vy in [-1, 1] times the robot's top speed (1 m/s in training); omega 0")
+        )
+        return rows
+    shape = "(B, T, 64, 64)" if r.lidar == "rings" else f"(B, T, {sensor['n_rays']})"
+    rows = [("`obs`", shape, _scan_words(r))] if r.kind != "memory" else [("`z`", f"(B, T, {r.z_size})", "code of V")]
+    if r.kind != "vae":
+        rows.append(("`goal`", "(B, T, 2) [m]", "goal x, goal y, robot frame"))
+        rows.append(("`action`", "(B, T, 3) [m/s, m/s, rad/s]", "the action that led to the row"))
+    return rows
+
+
+def _scan_words(r: Record) -> str:
+    if r.preprocessing is None:
+        return "not known"
+    words = _SCANS[r.preprocessing["scan"]]
+    return words + ("; nearest range cell cleared" if r.preprocessing["zero_first_bin"] else "")
+
+
+def _feature_order(r: Record) -> str:
+    if r.features is None:
+        return f"[{_scan_words(r)}, robot_state]"
+    order = {"z": ("z", "robot_state"), "h": ("robot_state", "h"), "zh": ("z", "robot_state", "h")}[r.features]
+    sizes = {"z": r.z_size, "robot_state": 5, "h": r.h_size}
+    return "[" + ", ".join(f"{name} ({sizes[name]})" for name in order) + "]"
+
+
+def quirks(r: Record) -> list[str]:
+    """Return what a user of this checkpoint should know beforehand."""
+    found = []
+    if r.kind in ("policy", "controller") and r.variant != "e2e_1d_carch":
+        size = "from 600 up to 10^5" if r.architecture == "e2e" else "typically 300 to 1000"
+        found.append(
+            f"Bang-bang control: means are {size} before they are clipped to [-1, 1], so vx and vy are nearly always "
+            "exactly -1 or 1. Use the mean; a sampled action flips signs."
+        )
+    if r.context_rule == "oldest-32" and r.kind != "world_model":
+        found.append(
+            "Frozen context: the memory was trained on the first 32 rows of an episode (6.4 s) and h stands still "
+            "afterwards. The default keeps to that."
+        )
+        found.append(
+            "Noisy h: the authors' software never left training mode, so dropout"
+            + (", a sampled z and a random LSTM start" if r.architecture == "joint" else " and a sampled z")
+            + ' were in every h that this controller saw. The default is deterministic; inference="as_released" brings '
+            "the noise back under a seed."
+        )
+    if r.architecture == "transformer":
+        found.append("z has 64 numbers; the paper says 32.")
+    if r.architecture == "modular" and (r.h_size and (r.features is None or "h" in r.features)) and r.kind != "vae":
+        found.append("h has 512 numbers (all LSTM cells); the paper says 64.")
+    if r.action_alignment == "leading":
+        found.append("Action alignment `leading`: a row goes with the action that led to it, (0, 0, 0) at the start.")
+    if r.architecture == "e2e" and r.preprocessing:
+        found.append(
+            "Ranges are fed in metres; the paper says normalised."
+            if r.lidar == "1d"
+            else "The nearest range cell is fed as measured; the encoders of the world models clear it."
+        )
+    return found
+
+
+def _ident(r: Record) -> str:
+    return "; ".join(f"`{f.id}`" for f in r.files) or "-"
+
+
+def describe(r: Record) -> list[str]:
+    """Return a record in words, one fact per line, for a terminal."""
+    lines = [r.name + (f"  (= {r.variant}.{RELEASED})" if r.released and r.tag != RELEASED else ""), _summary(r)]
+    for name, shape, meaning in inputs(r):
+        lines.append(f"{name.strip('`')}: {shape} {meaning}")
+    sizes = {"z": r.z_size, "h": r.h_size, "inputs": r.n_inputs, "parameters": r.n_parameters}
+    lines.append("sizes: " + ", ".join(f"{key} {value:,}" for key, value in sizes.items() if value is not None))
+    for f in r.files:
+        lines.append(f"file: {f.path} ({'size not known' if f.bytes is None else f'{f.bytes:,} bytes'}, {f.id})")
+    lines += [f"needs: {name}" for name in r.parts.values()]
+    if r.started:
+        lines.append(f"run started {r.started}, file written {r.saved}")
+    lines.append(f"from {r.source['repository']} at {r.source['commit']}, {r.source['license']}")
+    lines += [f"quirk: {text}" for text in quirks(r)] + [f"note: {text}" for text in r.notes]
+    lines += [f"result: {_result_words(x)}" for x in r.results] or ["results: not measured yet"]
+    return lines
+
+
+def _result_words(x: dict[str, Any]) -> str:
+    return (
+        f"{x['suite']} ({x['physics']} physics, {x['episodes']} episodes): success {x['success_rate']:.1%}, "
+        f"`goal` on the same episodes {x['goal_success_rate']:.1%}; {x['command']}"
+    )
+
+
+def _front_matter(variant: str, r: Record) -> str:
+    task = "reinforcement-learning" if r.kind in ("policy", "controller") else "feature-extraction"
+    tags = ["navrep", "robot-navigation", "lidar", "crowd", r.architecture]
+    tags += ["ppo"] if r.kind in ("policy", "controller") else ["world-models"]
+    lines = ["---", "license: mit", "library_name: navrep-data", f"pipeline_tag: {task}", "tags:"]
+    return "\n".join([*lines, *(f"- {tag}" for tag in tags), f"model_name: {variant}", "---"])
+
+
+def _whose(variant: str, runs: Sequence[Record]) -> str:
+    if any(r.tag == OWN for r in runs):
+        lead = f"`{variant}.{OWN}`: Retrained by navrep-data; not the authors' checkpoint. The other runs are theirs."
+    else:
+        lead = "The NavRep authors' weights, not ours."
+    return (
+        f"{lead} navrep-data is an independent re-implementation, not made or endorsed by the authors; it "
+        "contains none of their files and fetches them from their repository."
+    )
+
+
+def _use(variant: str, r: Record) -> str:
+    load = f'model = navrep_data.zoo.load("{variant}.{RELEASED}")'
+    if r.kind == "policy":
+        load = load.replace("model", "policy", 1)
+        more = ["policy.reset(batch_size=1)", "action = policy.act(scan, robot_state)"]
+    elif r.kind == "controller":
+        more = ["mean, value = model.controller(features)"]
+    else:
+        more = {
+            "vae": ["z = model.encode(obs)", "again = model.decode(z)"],
+            "memory": [],
+            "world_model": ["z = model.encode(obs)", "ahead = model.predict(obs, goal, action)"],
+        }[r.kind]
+    return "\n".join(["```python", "import navrep_data", "", load, *more, "```"])
+
+
+def _runs_table(runs: Sequence[Record]) -> str:
+    rows = []
+    for r in runs:
+        name = f"**`{r.name}`**" if r.released else f"`{r.name}`"
+        paths = "; ".join(f"`{f.path}`" for f in r.files) or "none of its own"
+        size = ", ".join("not known" if f.bytes is None else f"{f.bytes:,}" for f in r.files) or "-"
+        rows.append((name, r.started, r.saved, paths, size, _ident(r)))
+    return _table(("run", "started", "written", "file", "bytes", "checked by"), rows)
+
+
+def _results(runs: Sequence[Record]) -> str:
+    rows = [
+        (f"`{r.name}`", f"{x['suite']}, {x['physics']} physics", x["episodes"], f"{x['success_rate']:.1%}",
+         f"{x['goal_success_rate']:.1%}", f"`{x['command']}`")
+        for r in runs
+        for x in r.results
+    ]  # fmt: skip
+    if not rows:
+        return "Not measured yet."
+    return _table(("run", "suite", "episodes", "success rate", "`goal` on the same episodes", "command"), rows)
+
+
+def _parts(runs: Sequence[Record]) -> str:
+    r = runs[-1]
+    lines = [f"- {role}: `{name}`" for role, name in r.parts.items()]
+    if r.kind in ("world_model", "vae", "memory"):
+        users = sorted({d.variant for run in runs for d in dependants(run)})
+        lines.append("- used by: " + ", ".join(f"`{name}`" for name in users))
+    return "\n".join(lines) or "Nothing else."
+
+
+def card(variant: str) -> str:
+    """Return the card of a variant as Markdown with the front matter of the Hugging Face Hub.
+
+    Parameters
+    ----------
+    variant : str
+        Name without tag.
+    """
+    from navrep_data.shards.card import CITATION
+
+    runs = variants()[variant]
+    r = next((run for run in runs if run.released), runs[-1])
+    untagged = f"{variant}.{default_tag(variant)}"
+    notes = [f"`{run.name}`: {note}" for run in runs for note in run.notes]
+    one = f"`{variant}.{RELEASED}` is {r.released_rule}." if len(runs) == 1 else (
+        f"`{variant}.{RELEASED}` is `{r.name}`. {RELEASED_RULE}"
+    )  # fmt: skip
+    formats = sorted({_FORMATS[run.format] for run in runs if run.format})
+    sections = {
+        "Use": _use(variant, r),
+        "Inputs and outputs": _table(("name", "shape", "meaning"), inputs(r))
+        + "\n\nOther lidars: `navrep_data.observations.ScanAdapter`. One row is "
+        + f"{r.sensor['dt']:g} s.",
+        "Runs": f"{_runs_table(runs)}\n\n{one} The untagged name `{variant}` is `{untagged}`.",
+        "Needs": _parts(runs),
+        "Results": _results(runs),
+        "Known quirks": "\n".join(f"- {text}" for text in [*quirks(r), *notes]) or "None known.",
+        "Provenance": f"{r.source['repository']} at commit `{r.source['commit']}`, {r.source['license']} licence, "
+        f"{r.source['copyright']}."
+        + (f" The authors call the network `{r.source['backend']}`" if r.source["backend"] else "")
+        + (f", the features `{r.source['encoding']}`" if r.source["backend"] and r.source["encoding"] else "")
+        + ("." if r.source["backend"] else "")
+        + (f" Format: {'; '.join(formats)}." if formats else ""),
+        "Cite": f"```bibtex\n{CITATION}\n```",
+    }
+    sizes = {"z": r.z_size, "h": r.h_size, "parameters stored": r.n_parameters}
+    facts = ", ".join(f"{key} {value:,}" for key, value in sizes.items() if value is not None)
+    body = "\n\n".join(f"## {title}\n\n{text}" for title, text in sections.items())
+    head = f"{_front_matter(variant, r)}\n\n# {variant}\n\n{_whose(variant, runs)}"
+    return f"{head}\n\n{_summary(r)} Sizes: {facts}.\n\n{body}\n"
+
+
+def write_cards(folder: Path) -> list[Path]:
+    """Write the cards of all variants into `folder`, and remove those of variants that are no more.
+
+    Returns
+    -------
+    list of pathlib.Path
+        The files, sorted.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{variant}.md" for variant in variants()]
+    for path in paths:
+        path.write_text(card(path.stem), encoding="utf-8")
+    for path in set(folder.glob("*.md")) - set(paths):
+        path.unlink()
+    return paths
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("Expected one folder: python -m navrep_data.zoo.cards cards/models")
+    for written in write_cards(Path(sys.argv[1])):
+        print(written)

@@ -1,0 +1,172 @@
+"""``navrep-data models`` as a user meets it: real processes, closed stdin."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+E2E = "e2e_1d.20201026"
+E2E_FILE = "e2e1dnavreptrainenv_2020_10_26__14_10_51_PPO_E2E1D_VCARCH_C64_ckpt.zip"
+
+
+@pytest.fixture
+def run(tmp_path):
+    """The command, with an empty cache and no network."""
+
+    def call(*arguments, cwd=None, **variables):
+        environment = {k: v for k, v in os.environ.items() if not k.startswith(("NAVREP_RELEASED", "HF_"))}
+        environment |= {"COLUMNS": "200", "NAVREP_DATA_HOME": str(tmp_path / "home"), "NAVREP_DATA_OFFLINE": "1"}
+        return subprocess.run(
+            [sys.executable, "-m", "navrep_data", "models", *map(str, arguments)],
+            stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=cwd, timeout=300,
+            env={**environment, **variables},
+        )  # fmt: skip
+
+    return call
+
+
+def test_list(run):
+    done = run()
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) == 64
+    assert "transformer_rings_z.20201004" in done.stdout
+    assert "= transformer_rings_z.released" in done.stdout
+    done = run("*rings_z")
+    assert done.stdout == "", "wildcards that match no full name"
+    assert run("*rings_z.*").stdout.count("\n") == 11
+    assert len(json.loads(run("e2e_1d", "--json").stdout)) == 3
+    assert json.loads(run("--json").stdout)[0]["here"] is False
+
+
+def test_list_tells_what_is_here(run, shared):
+    found = json.loads(run("--json", NAVREP_RELEASED_DIR=str(shared / "released")).stdout)
+    assert sum(r["here"] for r in found if r["kind"] == "policy") == 19
+    gone = next(r for r in found if r["name"] == "transformer_rings_z.20201004")
+    assert gone["not_here"] == ["models/W/navreptraingpt"]
+
+
+@pytest.mark.parametrize("verb", [(), ("show",), ("fetch",), ("verify",)])
+def test_wrong_name(run, verb):
+    done = run(*verb, "transformer_ring_z")
+    assert done.returncode == 2
+    assert done.stderr == (
+        "Error: Unknown model 'transformer_ring_z'. Did you mean 'transformer_rings_z'? List all: navrep-data models\n"
+    )
+    assert done.stdout == ""
+
+
+def test_show(run):
+    done = run("show", E2E)
+    assert done.returncode == 0, done.stderr
+    assert E2E_FILE in done.stdout
+    assert "quirk: Bang-bang control" in done.stdout
+    assert "results: not measured yet" in done.stdout
+    assert "here: no; to fetch: models/gym/" in done.stdout
+    found = json.loads(run("show", E2E, "--json").stdout)
+    assert found["name"] == E2E
+    assert found["files"][0]["bytes"] == 1017662
+    done = run("show", "e2e_1d", "--json")
+    assert done.stderr == "e2e_1d -> e2e_1d.20201027: the NavRep authors' weights (e2e_1d.released)\n"
+    assert json.loads(done.stdout)["name"] == "e2e_1d.20201027"
+
+
+def test_fetch_offline(run, shared, tmp_path):
+    done = run("fetch", E2E)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"Error: {E2E} needs models/gym/{E2E_FILE} (sha256 ")
+    assert str(tmp_path / "home") in done.stderr
+    assert done.stderr.count("\n") == 1
+    done = run("fetch", E2E, "--from", shared / "released", "--json")
+    assert list(json.loads(done.stdout)["files"]) == [f"models/gym/{E2E_FILE}"]
+    done = run("fetch", "transformer_rings_z.released", "--from", shared / "released")
+    assert done.returncode == 1
+    assert "navreptraingpt (git blob 5d4e82c51a129a8aabc45bef0a51649b9eecc56a)" in done.stderr
+
+
+@pytest.mark.parametrize("verb", ["fetch", "verify"])
+def test_name_or_all(run, verb):
+    for arguments in ((), (E2E, "--all")):
+        done = run(verb, *arguments)
+        assert done.returncode == 2
+        assert f"Expected either NAME or --all: navrep-data models {verb} NAME" in done.stderr
+
+
+@pytest.mark.slow
+def test_verify_all(run, shared):
+    done = run("verify", "--all", "--from", shared / "released", "--golden", shared / "golden")
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = done.stdout.splitlines()
+    assert sum(line.startswith("ok ") for line in lines) == 56
+    missing = [lines[i + 1] for i, line in enumerate(lines) if line.startswith("missing ")]
+    assert len(missing) == 5
+    for path, blob, policies in [
+        ("models/M/navreptrainrnn.json", "eaf1ec048cd4b3704924a9a81b3118c3a34ba737", 6),
+        ("models/M/navreptrainrnn1d.json", "6bf6174d2a756365fcb2a3847dc825b7c6e8233b", 6),
+        ("models/V/navreptrainvae.json", "a821669b98a14c7d084e681aaab076a71ad7d077", 9),
+        ("models/W/navreptraingpt", "5d4e82c51a129a8aabc45bef0a51649b9eecc56a", 11),
+        ("models/W/navreptrainvaelstm", "5f7ed72a7208b54f84afb3a3609810118985ffc0", 7),
+    ]:
+        assert any(f"{path} (git blob {blob})" in m and f"; {policies} policies need it" in m for m in missing)
+    assert any(line.startswith("61 checkpoints: 56 right, 5 missing, 0 wrong; ") for line in lines)
+    assert "34 policies depend on files that are not here and cannot run:" in lines
+
+
+def test_verify_one(run, shared, tmp_path):
+    done = run("verify", E2E, "--from", shared / "released", "--json")
+    found = json.loads(done.stdout)
+    assert done.returncode == 0
+    assert found["ok"] is True
+    assert (found["right"], found["missing"], found["wrong"], found["cannot_run"]) == (1, 0, 0, [])
+    done = run("verify", "modular_1d_v", "--from", shared / "released", "--golden", shared / "golden", "--json")
+    outputs = json.loads(done.stdout)["checks"][0]["comparisons"]
+    assert {c["output"] for c in outputs} == {"mu", "logvar", "decode_mu", "decode_z"}
+    assert all(0 < c["error"] < c["tolerance"] for c in outputs)
+    assert run("verify", E2E).returncode == 1, "asked for by name and missing"
+
+
+@pytest.mark.slow
+def test_verify_finds_flipped_bytes_and_changed_golden_outputs(run, shared, tmp_path):
+    import numpy as np
+
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    name = "e2e1dnavreptrainenv_2020_09_01__11_44_49_PPO_E2E1D_VCARCH_C64_ckpt.zip"
+    data = bytearray((shared / "released" / "models" / "gym" / name).read_bytes())
+    data[5000] ^= 1
+    (folder / name).write_bytes(data)
+    done = run("verify", "e2e_1d.20200901", "--from", folder)
+    assert done.returncode == 1
+    assert "has sha256" in done.stdout
+    assert "1 checkpoints: 0 right, 0 missing, 1 wrong" in done.stdout
+
+    golden = tmp_path / "golden"
+    golden.mkdir()
+    source = shared / "golden" / f"E2E_{name.removesuffix('.zip')}.npz"
+    arrays = dict(np.load(source))
+    arrays["action_mean"] = arrays["action_mean"] * 1.001
+    np.savez(golden / source.name, **arrays)
+    done = run("verify", "e2e_1d.20200901", "--from", shared / "released", "--golden", golden)
+    assert done.returncode == 1
+    assert "action_mean differs by" in done.stdout
+    shutil.copy(source, golden)
+    assert run("verify", "e2e_1d.20200901", "--from", shared / "released", "--golden", golden).returncode == 0
+
+
+@pytest.mark.slow
+def test_convert(run, shared, tmp_path):
+    file = shared / "released" / "models" / "gym" / E2E_FILE
+    done = run("convert", file, "--out", tmp_path / "e2e.safetensors", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["file"] == str(file)
+    assert (tmp_path / "e2e.safetensors").stat().st_size > 900_000
+    done = run("convert", file, "--out", tmp_path / "e2e.safetensors")
+    assert done.returncode == 2
+    assert "exists already and is not overwritten" in done.stderr
+    done = run("convert", tmp_path / "nothing.zip")
+    assert (done.returncode, "is not a file" in done.stderr) == (2, True)
+    (tmp_path / "junk.zip").write_bytes(b"junk")
+    done = run("convert", tmp_path / "junk.zip", "--out", tmp_path / "junk.safetensors")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)

@@ -1,0 +1,83 @@
+"""Model cards: current, complete, with front matter that the Hub reads."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import yaml
+
+from navrep_data.zoo import cards, registry
+
+FOLDER = Path(__file__).resolve().parents[2] / "cards" / "models"
+VARIANTS = sorted(registry.variants())
+
+
+def test_cards_are_current(tmp_path):
+    made = {path.name: path.read_text() for path in cards.write_cards(tmp_path)}
+    there = {path.name: path.read_text() for path in FOLDER.glob("*.md")}
+    assert set(made) == set(there), "run: python -m navrep_data.zoo.cards cards/models"
+    stale = [name for name in made if made[name] != there[name]]
+    assert stale == [], "run: python -m navrep_data.zoo.cards cards/models"
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_card(variant):
+    text = cards.card(variant)
+    _, front, body = text.split("---\n", 2)
+    head = yaml.safe_load(front)
+    assert head["license"] == "mit"
+    assert head["library_name"] == "navrep-data"
+    assert "navrep" in head["tags"]
+    for title in ("Use", "Inputs and outputs", "Runs", "Needs", "Results", "Known quirks", "Provenance", "Cite"):
+        assert f"\n## {title}\n" in body
+    for record in registry.variants()[variant]:
+        assert record.name in body
+        for f in record.files:
+            assert f.path in body
+            assert str(f.id) in body
+        assert all(note in body for note in record.notes)
+    assert "not made or endorsed by the authors" in body
+    assert "f824612cc2649fa7d396647f1abc4516e10fae88" in body
+    assert "/work/" not in text
+    assert "/root/" not in text
+
+
+def test_cards_tell_the_quirks_where_they_apply():
+    def told(words):
+        return {v for v in VARIANTS if words in cards.card(v)}
+
+    policies = {v for v, runs in registry.variants().items() if runs[0].kind in ("policy", "controller")}
+    assert told("Bang-bang control") == policies - {"e2e_1d_carch"}
+    frozen = {f"{a}_{lidar}_{f}" for a in ("joint", "transformer") for lidar in ("1d", "rings") for f in ("h", "zh")}
+    assert told("Frozen context") == told("Noisy h") == frozen
+    assert told("z has 64 numbers; the paper says 32") == {v for v in VARIANTS if v.startswith("transformer")}
+    h512 = {f"modular_{lidar}{end}" for lidar in ("1d", "rings") for end in ("", "_m", "_h", "_zh")}
+    assert told("h has 512 numbers") == h512
+    assert told("MAYBEPARTIAL") == {"transformer_rings_z"}
+    assert told("started last") == {v for v, runs in registry.variants().items() if len(runs) > 1}
+
+
+def test_results_are_shown_with_command_and_baseline(monkeypatch):
+    assert "Not measured yet." in cards.card("modular_1d_z")
+    runs = registry.variants()["e2e_1d"]
+    result = {
+        "suite": "navreptest", "physics": "original", "episodes": 200, "success_rate": 0.625,
+        "goal_success_rate": 0.15, "command": "navrep-data benchmark zoo:e2e_1d.20201026 --suite navreptest",
+    }  # fmt: skip
+    measured = tuple(dataclasses.replace(r, results=(result,)) if r.tag == "20201026" else r for r in runs)
+    monkeypatch.setattr(cards, "variants", lambda: {"e2e_1d": measured})
+    text = cards.card("e2e_1d")
+    assert (
+        "| `e2e_1d.20201026` | navreptest, original physics | 200 | 62.5% | 15.0% | "
+        "`navrep-data benchmark zoo:e2e_1d.20201026 --suite navreptest` |"
+    ) in text
+    assert "success 62.5%, `goal` on the same episodes 15.0%" in "\n".join(cards.describe(measured[1]))
+
+
+@pytest.mark.parametrize("name", sorted(registry.records()))
+def test_describe(name):
+    record = registry.records()[name]
+    text = "\n".join(cards.describe(record))
+    assert text.startswith(name)
+    assert "results: not measured yet" in text
+    assert all(f.path in text for f in record.files)
