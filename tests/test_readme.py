@@ -27,8 +27,12 @@ def test_there_are_blocks_of_both_kinds():
 @pytest.mark.slow
 def test_code_blocks_run(tmp_path):
     env = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    shared = README.parent.parent / "shared" / "released"
+    env["NAVREP_RELEASED_DIR"] = str(shared)
     ran = 0
     for kind, code in blocks():
+        if "zoo.load" in code and not shared.is_dir():
+            continue  # needs ../shared/released: the authors' files are not part of the repository
         if kind == "python":
             commands = [[sys.executable, "-W", "error", "-c", code]]
         else:

@@ -21,10 +21,13 @@ import numpy as np
 import numpy.typing as npt
 from isal import isal_zlib
 
+from navrep_data.schema import RINGS_SHAPE
+from navrep_data.shards._rings_deflate import deflate_rings
+
 DEFLATE_LEVEL = 1
 # Below this size a Huffman table per plane costs more than it saves.
 SPLIT_PLANE_BYTES = 8192
-# A plane is stored as it is where an eighth from its middle deflates to no less than this.
+# A plane is stored as it is where an eighth from its middle has more than this share of a byte's entropy.
 _NOISE_RATIO = 0.85
 _ZLIB_HEADER = b"\x78\x01"
 _STORED_BLOCK_MAX = 0xFFFF
@@ -52,6 +55,10 @@ def encode(block: npt.NDArray[Any]) -> bytes:
     block : ndarray of shape (rows, ...)
         One whole chunk.
     """
+    if block.shape[1:] == RINGS_SHAPE and block.dtype == np.uint8:
+        stream = deflate_rings(block)
+        if stream is not None:
+            return b"".join([_ZLIB_HEADER, stream, int(isal_zlib.adler32(block)).to_bytes(4, "big")])
     if block.dtype.itemsize == 1:
         return bytes(deflate.zlib_compress(block.reshape(-1).view(np.uint8), DEFLATE_LEVEL))
     planes = _planes(block)
@@ -68,9 +75,11 @@ def encode(block: npt.NDArray[Any]) -> bytes:
 
 
 def _is_noise(plane: npt.NDArray[np.uint8]) -> bool:
-    """Return whether deflating `plane` would save little, judged by a sample from its middle."""
+    """Return whether deflating `plane` would save little, judged by the entropy of a sample from its middle."""
     sample = plane[plane.size * 7 // 16 : plane.size * 9 // 16]
-    return len(deflate.deflate_compress(sample, DEFLATE_LEVEL)) > _NOISE_RATIO * sample.size
+    share = np.bincount(sample, minlength=256) / sample.size
+    bits = -(share * np.log2(np.where(share > 0, share, 1.0))).sum()
+    return bool(bits > 8 * _NOISE_RATIO)
 
 
 def _stored_blocks(plane: npt.NDArray[np.uint8]) -> list[bytes]:

@@ -22,7 +22,7 @@ from navrep_data.schema import (
 )
 
 SCAN_DTYPES = ("uint16", "float32")
-CHUNK_TARGET = 20
+CHUNK_TARGET = 25
 CHUNK_RANGE = (12, 40)
 # HDF5 keeps a chunk index entry and a header per narrow chunk, so one chunk per sequence; but not megabytes
 # in one.
@@ -30,21 +30,20 @@ NARROW_CHUNK_MAX = 4096
 VECTOR_COLUMNS = ("robot_state", "action", "robot_pose", "leading_action", "source_robot_state", "humans")
 """Columns whose last axis holds different quantities: their statistics are lists, one entry per component."""
 
-# Measured at 20 rows per chunk: scan and rings on one of the original's sequences; humans (17.5 of 30 slots
-# filled) and the rest on synthetic episodes. _BYTES_EXTRA is a guess for chunk index, headers and worlds.
+# Measured on 20 sequences of soadrl (20,000 rows, 25 rows per chunk); leading_* and source_* on an import.
 BYTES_PER_ROW: dict[str, float] = {
-    "scan": 1305.0,
-    "rings": 290.0,
-    "robot_state": 16.7,
-    "action": 8.7,
-    "reward": 3.7,
-    "robot_pose": 7.6,
+    "scan": 1290.0,
+    "rings": 224.0,
+    "robot_state": 17.1,
+    "action": 10.5,
+    "reward": 3.0,
+    "robot_pose": 9.5,
     "leading_action": 20.0,
     "leading_reward": 8.0,
     "source_robot_state": 26.0,
 }
 _BYTES_PER_FLOAT32_RAY = 2.55
-_BYTES_PER_HUMAN_SLOT = 11.5
+_BYTES_PER_HUMAN_SLOT = 6.9
 _BYTES_OTHER_COLUMN = 0.3
 _BYTES_EXTRA = 20.0
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from navrep_data.errors import PolicyError, SimulationError
 from navrep_data.observations import scan_to_rings
-from navrep_data.schema import ACTION_SIZE, HUMAN_FIELDS, Event
+from navrep_data.schema import ACTION_SIZE, HUMAN_FIELDS, RINGS_SHAPE, Event
 from navrep_data.sim import _layout as lay
 from navrep_data.sim._batch import reset_worlds, seed_worlds
 from navrep_data.sim._rollout import begin_rows, finish_rows, rollout_sequence
@@ -56,6 +56,8 @@ class _Outputs:
         # every row may start an episode (a policy can give up at once), so tables grow only up to this
         starts = length
         self.scan = np.zeros((n, length, config.sensor.n_rays), settings.scan_dtype)
+        # reused where one sequence at a time is made: fresh pages cost more than the rings themselves
+        self.rings = np.zeros((length, *RINGS_SHAPE), np.uint8) if settings.rings and n == 1 else None
         self.floats = np.zeros((n, length, _FLOATS), np.float32)
         self.ints = np.zeros((n, length, _INTS), np.int32)
         self.humans = np.zeros((n, length if settings.humans else 1, crowd, len(HUMAN_FIELDS)), np.float32)
@@ -72,7 +74,7 @@ def _columns(out: _Outputs, w: int, sequence: int, settings: RolloutSettings) ->
     step = ints[:, 2].copy()
     columns: dict[str, NDArray[Any]] = {"scan": out.scan[w]}
     if settings.rings:
-        columns["rings"] = scan_to_rings(out.scan[w])
+        columns["rings"] = scan_to_rings(out.scan[w], out=out.rings)
     columns |= {
         "robot_state": np.ascontiguousarray(floats[:, _STATE]),
         "action": np.ascontiguousarray(floats[:, _ACTION]),

@@ -149,7 +149,8 @@ def test_workers_do_not_outlive_their_driver(tmp_path):
     script = tmp_path / "run.py"
     script.write_text(
         "from navrep_data.generate import generate\n"
-        f"if __name__ == '__main__':\n    generate(n=4000, out={str(tmp_path / 'd')!r}, workers=2, seed=1, shard_size=1)\n"
+        "if __name__ == '__main__':\n"
+        f"    generate(n=4000, out={str(tmp_path / 'd')!r}, workers=2, seed=1, shard_size=1)\n"
     )
     process = subprocess.Popen([sys.executable, str(script)])
     deadline = time.monotonic() + 60

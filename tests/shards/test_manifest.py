@@ -242,4 +242,4 @@ def test_estimate_is_near_for_full_size_columns():
     less = estimate_bytes(("scan", "reward"), 1_000_000, **kwargs)
     assert less < estimate_bytes(ALL_COLUMNS, 1_000_000, **kwargs)
     assert MAX_HUMANS < 30
-    assert chunk_rows(1000) == 20
+    assert chunk_rows(1000) == 25

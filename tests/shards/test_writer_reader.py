@@ -126,7 +126,7 @@ def test_attributes_serve_plain_h5py(tmp_path):
 
 
 def test_chunk_rows_divide_the_length():
-    assert [chunk_rows(n) for n in (1000, 997, 7, 1, 36, 48)] == [20, 20, 20, 20, 18, 16]
+    assert [chunk_rows(n) for n in (1000, 997, 7, 1, 36, 48)] == [25, 25, 25, 25, 18, 24]
 
 
 @pytest.mark.parametrize("noise", [True, False])
