@@ -33,7 +33,7 @@ VECTOR_COLUMNS = ("robot_state", "action", "robot_pose", "leading_action", "sour
 # Measured on 20 sequences of soadrl (20,000 rows, 25 rows per chunk); leading_* and source_* on an import.
 BYTES_PER_ROW: dict[str, float] = {
     "scan": 1290.0,
-    "rings": 224.0,
+    "rings": 150.0,
     "robot_state": 17.1,
     "action": 10.5,
     "reward": 3.0,
