@@ -28,7 +28,8 @@ def test_there_are_blocks_of_both_kinds():
 def test_code_blocks_run(tmp_path):
     env = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     shared = README.parent.parent / "shared" / "released"
-    env["NAVREP_RELEASED_DIR"] = str(shared)
+    if shared.is_dir():
+        env["NAVREP_RELEASED_DIR"] = str(shared)
     ran = 0
     for kind, code in blocks():
         if "zoo.load" in code and not shared.is_dir():
@@ -52,6 +53,6 @@ def test_paths_named_in_the_readme_exist():
     for target in re.findall(r"\]\(([^)#]+)\)", README.read_text()):
         if not target.startswith("http"):
             assert (root / target).exists(), target
-    for folder in re.findall(r"pytest (?:-m \"[^\"]*\" )?((?:tests/\S+ ?)+)`", README.read_text()):
+    for folder in re.findall(r"pytest (?:-m \"[^\"]*\" )?((?:tests/[^\s`]+ ?)+)`", README.read_text()):
         for path in folder.split():
             assert (root / path).exists(), path

@@ -73,6 +73,7 @@ def test_verify_finds_a_flipped_byte(dataset, tmp_path):
     assert not json.loads(run("verify", tmp_path / "d", "--json").stdout)["ok"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.slow  # seconds each; `make test` runs them
+
 E2E = "e2e_1d.20201026"
 E2E_FILE = "e2e1dnavreptrainenv_2020_10_26__14_10_51_PPO_E2E1D_VCARCH_C64_ckpt.zip"
 
@@ -63,7 +65,7 @@ def test_show(run):
     assert done.returncode == 0, done.stderr
     assert E2E_FILE in done.stdout
     assert "quirk: Bang-bang control" in done.stdout
-    assert "results: not measured yet" in done.stdout
+    assert "navreptest" in done.stdout
     assert "here: no; to fetch: models/gym/" in done.stdout
     found = json.loads(run("show", E2E, "--json").stdout)
     assert found["name"] == E2E

@@ -16,7 +16,10 @@ from torch.utils.data import DataLoader
 from navrep_data.datasets import SequenceDataset, StreamingSequenceDataset
 from navrep_data.errors import ConfigError
 
-pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning"),
+]
 
 SEQUENCES = [[9, 1, 3], [11], [2, 5, 4, 4], [1], [30], [7, 8], [12, 1, 1], [3, 3, 3]]
 W = 4

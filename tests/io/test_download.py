@@ -12,6 +12,8 @@ from http_server import Site, serving
 from navrep_data.errors import CorruptDataError, DownloadError, OfflineError
 from navrep_data.io import FileId, download, git_blob_sha1, is_offline
 
+pytestmark = pytest.mark.slow  # seconds in all; `make test` runs them
+
 DATA = random.Random(0).randbytes(3001)
 RIGHT = FileId(len(DATA), hashlib.sha256(DATA).hexdigest())
 BLOB = FileId(git_blob_sha1=hashlib.sha1(b"blob 3001\0" + DATA).hexdigest())

@@ -7,6 +7,8 @@ import torch
 from navrep_data.errors import ConfigError
 from navrep_data.models import Noise, checkpoint
 
+pytestmark = pytest.mark.slow  # seconds each; `make test` runs them
+
 STEPS, BATCH = 70, 5
 
 

@@ -232,6 +232,7 @@ def test_rollouts_equal_rvo2():
             s.preferred = toward(s.goal, s.position)
 
 
+@pytest.mark.slow
 def test_neighbours_at_the_end_of_the_range_equal_the_walk():
     """RVO2's walk prunes by distances to lines, which rounding can put beyond the range before the edge itself."""
     rng = np.random.default_rng(11)

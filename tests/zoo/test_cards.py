@@ -79,5 +79,5 @@ def test_describe(name):
     record = registry.records()[name]
     text = "\n".join(cards.describe(record))
     assert text.startswith(name)
-    assert "results: not measured yet" in text
+    assert ("results: not measured yet" in text) == (not record.results)
     assert all(f.path in text for f in record.files)

@@ -19,6 +19,8 @@ from navrep_data.models import checkpoint
 from navrep_data.zoo.importers import load_any, load_controller_zip, load_tf_json, load_torch_world_model
 from navrep_data.zoo.importers_sb2 import controller_variables, end_to_end_variables
 
+pytestmark = pytest.mark.slow  # seconds in all; `make test` runs them
+
 
 class Bomb:
     """Makes a folder when it is unpickled."""

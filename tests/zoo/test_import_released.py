@@ -18,6 +18,8 @@ from navrep_data.models import (
 from navrep_data.models.noise import Noise
 from navrep_data.zoo.importers import load_any, load_controller_zip, load_tf_json, load_torch_world_model
 
+pytestmark = pytest.mark.slow  # seconds each; `make test` runs them
+
 WORLD_MODELS = {"gpt1d": "W_navreptraingpt1d", "vae1dlstm": "W_navreptrainvae1dlstm"}
 
 

@@ -19,6 +19,8 @@ from navrep_data.zoo.assemble import build
 from navrep_data.zoo.importers import load_controller_zip, load_tf_json, load_torch_world_model
 from navrep_data.zoo.policy import Policy
 
+pytestmark = pytest.mark.slow  # seconds each; `make test` runs them
+
 ENCODINGS = {"z": "V_ONLY", "zh": "VM", "h": "M_ONLY"}
 
 

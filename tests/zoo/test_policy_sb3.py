@@ -10,6 +10,8 @@ from navrep_data.models.vae import VAE, VAEConfig
 from navrep_data.zoo.policy import Policy
 from navrep_data.zoo.sb3 import spaces, take_weights, to_sb3
 
+pytestmark = pytest.mark.slow  # seconds each; `make test` runs them
+
 
 def policies():
     torch.manual_seed(0)

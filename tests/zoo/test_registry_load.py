@@ -8,6 +8,8 @@ from navrep_data.errors import ConfigError, CorruptDataError, OfflineError, Poli
 from navrep_data.zoo import registry
 from navrep_data.zoo.fetching import Source, missing_here
 
+pytestmark = pytest.mark.slow  # seconds each; `make test` runs them
+
 RUNS = {r.name: r for r in registry.records().values()}
 WHOLE = sorted(
     name
