@@ -42,11 +42,13 @@ def test_json_is_one_object_on_stdout(tmp_path):
     assert "2 sequences x 20 steps" in done.stderr
 
 
+@pytest.mark.slow
 def test_default_folder_is_data_env(tmp_path):
     assert run("generate", "--n", 1, *FLAGS, cwd=tmp_path).returncode == 0
     assert (tmp_path / "data" / "soadrl" / "manifest.json").exists()
 
 
+@pytest.mark.slow
 def test_info(dataset):
     text = run("info", dataset[0]).stdout
     assert "soadrl, consistent physics, seed 0 (complete)" in text
@@ -56,6 +58,7 @@ def test_info(dataset):
     assert found["splits"] == {"train": 2, "val": 1, "test": 1}
 
 
+@pytest.mark.slow
 def test_verify_finds_a_flipped_byte(dataset, tmp_path):
     import shutil
 
@@ -98,6 +101,7 @@ def test_mistakes_give_one_line_and_exit_2(arguments, words, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_debug_shows_the_traceback(tmp_path):
     done = run("--debug", "info", "nowhere", cwd=tmp_path)
     assert "Traceback" in done.stderr
