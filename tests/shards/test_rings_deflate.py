@@ -85,3 +85,14 @@ def test_hdf5_reads_it(tmp_path):
         d.id.write_direct_chunk((0, 0, 0), encode(block))
     with h5py.File(tmp_path / "a.h5") as file:
         np.testing.assert_array_equal(file["r"][:], block)
+
+
+def test_every_copy_length():
+    """Stretches of 1 to 600 cells that equal what stands 64 cells ago, each ended by a cell that does not."""
+    cells = list(np.random.default_rng(4).integers(0, 3, 64))
+    for length in range(1, 601):
+        for _ in range(length):
+            cells.append(cells[-64])
+        cells.append((cells[-64] + 1) % 3)
+    cells += [0] * (-len(cells) % 4096)
+    check(np.array(cells, np.uint8).reshape(-1, 64, 64))

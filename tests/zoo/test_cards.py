@@ -38,8 +38,8 @@ def test_card(variant):
         assert all(note in body for note in record.notes)
     assert "not made or endorsed by the authors" in body
     assert "f824612cc2649fa7d396647f1abc4516e10fae88" in body
-    assert "/work/" not in text
-    assert "/root/" not in text
+    assert str(Path(__file__).resolve().parents[2]) not in text
+    assert str(Path.home()) not in text
 
 
 def test_cards_tell_the_quirks_where_they_apply():
