@@ -168,7 +168,7 @@ def generate(
     Source of the recipe: make_vae_dataset.py of the original. Difference: rows follow RLDS, with each episode's first
     observation and the action taken from it.
     """
-    say = report or (lambda _: None)
+    say = report or _silent
     started = time.perf_counter()
     config = make_config(
         env, physics=physics, humans=humans, obstacles=obstacles, rendering="legs" if legs else "trunk"
@@ -358,6 +358,8 @@ class _Run:
         self._finish()
 
     def _announce(self, done_rows: int, workers: int) -> None:
+        if self.say is _silent:
+            return  # the estimate costs a few hundred rows
         r, s = self.request, self.request.spec
         with _Notice(self.say, "Compiling kernels (once, about 30 s)"):
             per_row = seconds_per_row(s) if s.policy.scripted else None
@@ -431,6 +433,10 @@ class _Notice:
 
     def __exit__(self, *_: object) -> None:
         self._timer.cancel()
+
+
+def _silent(_: str) -> None:
+    """Report to nobody."""
 
 
 def _size(n_bytes: int) -> str:

@@ -19,8 +19,9 @@ import numpy.typing as npt
 
 from navrep_data.schema import COLUMNS, EVENT_NAMES, SCAN_SCALE
 from navrep_data.shards._layout import VECTOR_COLUMNS
+from navrep_data.shards._sums import count_cells, sum_rays
 
-# 512 KiB of float64 stay in the cache; 65535**2 * 65536 < 2**53 keeps the sums exact.
+# 512 KiB of float64 stay in the cache.
 _BLOCK_ITEMS = 65536
 _MEANINGLESS_ON_LAST_ROW = ("action", "reward")
 
@@ -94,17 +95,17 @@ class Moments:
 
 def _scan_moments(scan: npt.NDArray[Any]) -> Moments:
     """Return the moments of the valid rays (> 0), in the stored unit."""
-    sums = Moments.empty(1)
     rays = scan.reshape(-1)
+    if rays.dtype == np.uint16:
+        return _whole_moments(sum_rays(rays))
+    sums = Moments.empty(1)
     # One buffer for all blocks: fresh large arrays cost more in page faults than the sums themselves.
     buffer = np.empty(min(_BLOCK_ITEMS, rays.size))
     for start in range(0, rays.size, _BLOCK_ITEMS):
         block = rays[start : start + _BLOCK_ITEMS]
-        valid = np.count_nonzero(block) if block.dtype.kind == "u" else None
-        if valid != block.size:
-            block = block[block > 0]  # also drops NaN
-            if not block.size:
-                continue
+        block = block[block > 0]  # also drops NaN
+        if not block.size:
+            continue
         wide = buffer[: block.size]
         wide[:] = block
         part = [block.size, np.einsum("i->", wide), np.einsum("i,i->", wide, wide), block.min(), block.max()]
@@ -114,12 +115,18 @@ def _scan_moments(scan: npt.NDArray[Any]) -> Moments:
 
 def _rings_moments(rings: npt.NDArray[Any]) -> Moments:
     """Return the moments of cells 0/1/2 from their counts."""
-    known = np.count_nonzero(rings)
-    twos = np.count_nonzero(rings == 2)
+    known, twos = count_cells(np.ascontiguousarray(rings).reshape(-1))
     ones = known - twos
     low = 0 if known < rings.size else 1 if ones else 2
-    part = [rings.size, ones + 2 * twos, ones + 4 * twos, low, 2 if twos else min(ones, 1)]
-    return Moments(*(np.array([v], np.float64) for v in part))
+    return _whole_moments((rings.size, ones + 2 * twos, ones + 4 * twos, low, 2 if twos else min(ones, 1)))
+
+
+def _whole_moments(sums: tuple[int, int, int, int, int]) -> Moments:
+    """Return the moments of one component whose count, total, squares, least and largest are whole numbers."""
+    count, total, squares, low, high = sums
+    if not count:
+        return Moments.empty(1)
+    return Moments(*(np.array([v], np.float64) for v in (count, total, squares, low, high)))
 
 
 def _plain_moments(values: npt.NDArray[Any], components: int, may_be_nan: bool) -> Moments:

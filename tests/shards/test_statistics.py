@@ -96,3 +96,18 @@ def test_statistics_from_elsewhere_are_checked():
     ):
         assert check_statistics(bad, ALL_COLUMNS) != ""
     assert set(ALL_COLUMNS) <= set(COLUMNS)
+
+
+@pytest.mark.parametrize("rays", [[0, 0], [65535, 0, 65535], [1], [0, 1, 2], [65535]])
+def test_extreme_rays(rays):
+    columns, worlds = make_sequence(0, 150)
+    flat = columns["scan"].reshape(-1)
+    flat[:] = 0
+    flat[: len(rays)] = rays
+    valid = [r * 0.001 for r in rays if r > 0]
+    got = image_of([(columns, worlds)])["columns"]["scan"]
+    assert got["count"] == len(valid)
+    assert got["min"] == (pytest.approx(min(valid)) if valid else None)
+    assert got["max"] == (pytest.approx(max(valid)) if valid else None)
+    assert got["mean"] == (pytest.approx(np.mean(valid)) if valid else None)
+    assert got["std"] == (pytest.approx(np.std(valid), abs=1e-9) if valid else None)

@@ -1,0 +1,39 @@
+# mypy: allow-untyped-defs, allow-untyped-decorators, no-check-untyped-defs
+"""Sums over the two large columns of integers, in one pass and exact."""
+
+import numpy as np
+
+from navrep_data._kernels import kernel
+
+
+@kernel
+def sum_rays(rays):
+    """Return count, total, total of squares, least and largest of the values above 0 of rays (n,) uint16.
+
+    Squares are below 2**32, so up to 2**31 rays cannot overflow.
+    """
+    zeros = 0
+    total = np.int64(0)
+    squares = np.int64(0)
+    low = np.int64(0xFFFF)
+    high = np.int64(0)
+    for k in range(rays.shape[0]):
+        value = np.int64(rays[k])
+        zeros += 1 if value == 0 else 0
+        total += value
+        squares += value * value
+        high = max(high, value)
+        # 0 - 1 wraps to the largest value: zeros then never are the least
+        low = min(low, (value - 1) & 0xFFFF)
+    return rays.shape[0] - zeros, total, squares, low + 1, high
+
+
+@kernel
+def count_cells(cells):
+    """Return how many of cells (n,) uint8 are not 0, and how many are 2."""
+    known = 0
+    twos = 0
+    for k in range(cells.shape[0]):
+        known += 1 if cells[k] != 0 else 0
+        twos += 1 if cells[k] == 2 else 0
+    return known, twos
