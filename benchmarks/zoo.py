@@ -1,10 +1,11 @@
 """Actions per second of released policies on one core, at batch 256, and what bf16 changes in their actions.
 
-    python benchmarks/zoo.py [--source DIR] [--json]
+    python benchmarks/zoo.py [--source DIR] [--write] [--json]
 
 float32 and bfloat16 run in turns (A B A B ...), in one process with one thread. Scans are those of 256 soadrl worlds.
 Weights are the released ones where they are at hand (``--source``, NAVREP_RELEASED_DIR or ../shared/released), made-up
-ones otherwise: speed does not depend on them, and the comparison of actions is then left out.
+ones otherwise: speed does not depend on them, and the comparison of actions is then left out. ``--write`` puts the
+table into benchmarks/RESULTS.md. The exit code is 1 if a row misses its "must".
 """
 
 from __future__ import annotations
@@ -18,11 +19,13 @@ from pathlib import Path
 from typing import Any
 
 from harness import ONE_THREAD, Timing, in_turns, machine, ratio, run_child, spread
+from report import describe, number, table, write_section
 
 BATCH = 256
 SHARED = Path(__file__).resolve().parents[1].parent / "shared" / "released"
-AIMS = {"transformer_1d_z": 20_000, "joint_1d_z": 20_000, "modular_1d_z": 20_000}
-AIMS |= {name.replace("1d", "rings"): 5_000 for name in AIMS}
+# Part 3: actions per second on one core at this batch size.
+MUST = {"transformer_1d_z": 20_000, "joint_1d_z": 20_000, "modular_1d_z": 20_000}
+MUST |= {name.replace("1d", "rings"): 5_000 for name in MUST}
 MORE = ("e2e_1d", "e2e_rings", "joint_1d_zh", "transformer_1d_zh", "transformer_1d_h")
 
 
@@ -118,35 +121,66 @@ def measure(variant: str, source: str | None, repeats: int, seconds: float) -> d
         "wall": spread(ours.wall)["median"],
         "float32": f32["median"],
         "ratio": ratio(ours.cpu, other.cpu),
-        "aim": AIMS.get(variant),
+        "must": MUST.get(variant),
         "released_weights": released,
         "same_actions": same_actions(exact, rounded, scans, states) if released else None,
     }
 
 
-def show(row: dict[str, Any]) -> str:
-    """Return a measured row as a line of the table."""
+HEADER = (
+    "policy",
+    "actions/s, bf16",
+    "spread",
+    "must",
+    "verdict",
+    "actions/s, float32",
+    "ratio",
+    "actions bf16 leaves",
+)
+INTRODUCTION = """## Policies of the zoo
+
+{machine}
+
+`policy.act` from raw scans, batches of {batch}, one thread: median over turns, per second of CPU time. bf16 is asked
+for by `zoo.load(..., dtype="bfloat16")`. The last column is the share of action components that it changes by less than 1e-3.
+"""
+
+
+def verdict(row: dict[str, Any]) -> str:
+    """Return whether a row reaches what it must."""
     if "error" in row:
-        return f"| {row['variant']} | {row['error']} |"
-    aim = "-" if row["aim"] is None else f"{row['aim']:,}"
+        return "FAIL"
+    if row["must"] is None:
+        return "-"
+    return "pass" if row["value"] >= row["must"] else "FAIL"
+
+
+def show(row: dict[str, Any]) -> list[str]:
+    """Return a measured row as the cells of the table."""
+    if "error" in row:
+        return [row["variant"], *["-"] * 3, "FAIL", *["-"] * 2, row["error"]]
     same = "- (made-up weights)" if row["same_actions"] is None else f"{100 * row['same_actions']:.2f} %"
-    figures = f"{row['value']:,.0f} | {row['low']:,.0f} to {row['high']:,.0f} | {aim} | {row['float32']:,.0f}"
-    return f"| {row['variant']} | {figures} | {row['ratio']:.2f} | {same} |"
+    return [
+        row["variant"], number(row["value"]), f"{number(row['low'])} to {number(row['high'])}", number(row["must"]),
+        verdict(row), number(row["float32"]), f"{row['ratio']:.2f}", same,
+    ]  # fmt: skip
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     known = os.environ.get("NAVREP_RELEASED_DIR") or (str(SHARED) if SHARED.is_dir() else None)
     parser.add_argument("--source", default=known, help="folder of the released files")
-    parser.add_argument("--only", nargs="+", default=[*AIMS, *MORE], metavar="VARIANT")
+    parser.add_argument("--only", nargs="+", default=[*MUST, *MORE], metavar="VARIANT")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=1.0)
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--write", action="store_true", help="update benchmarks/RESULTS.md")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
     parser.add_argument("--child", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.child:
         print(json.dumps(measure(args.child, args.source, args.repeats, args.seconds)))
-        return
+        return 0
+    where = machine()
     rows = []
     for variant in args.only:
         print(f"measuring {variant} ...", file=sys.stderr, flush=True)
@@ -155,12 +189,14 @@ def main() -> None:
             options += ["--source", args.source]
         rows.append({"variant": variant, **run_child([Path(__file__), *options], **ONE_THREAD)})
     if args.json:
-        print(json.dumps({"machine": machine(), "batch": BATCH, "rows": rows}))
-        return
-    print("| policy | actions/s, bf16 | spread | aim | actions/s, float32 | ratio | actions bf16 leaves equal |")
-    print("|---|---|---|---|---|---|---|")
-    print("\n".join(show(row) for row in rows))
+        print(json.dumps({"machine": where, "batch": BATCH, "rows": rows}))
+    else:
+        text = INTRODUCTION.format(machine=describe(where), batch=BATCH) + "\n" + table(HEADER, map(show, rows))
+        print(text)
+        if args.write:
+            write_section("zoo.py", text)
+    return int(any(verdict(row) == "FAIL" for row in rows))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
