@@ -142,7 +142,8 @@ INTRODUCTION = """## Policies of the zoo
 {machine}
 
 `policy.act` from raw scans, batches of {batch}, one thread: median over turns, per second of CPU time. bf16 is asked
-for by `zoo.load(..., dtype="bfloat16")`. The last column is the share of action components that it changes by less than 1e-3.
+for by `zoo.load(..., dtype="bfloat16")`. The last column is the share of action components that it changes by less
+than 1e-3.
 """
 
 
