@@ -372,7 +372,7 @@ class _Run:
         self.say(f"{text} on {workers} core{'s' if workers > 1 else ''}")
 
     def _clean_up(self) -> None:
-        """Remove what killed runs left behind: temp files and shards that never left staging."""
+        """Remove what killed processes left behind: temp files and shards that never left staging."""
         shutil.rmtree(self.root / STAGING, ignore_errors=True)
         for folder in (self.root, self.root / "data", self.root / "worlds"):
             for path in folder.glob(f".*{PART_SUFFIX}"):
@@ -417,8 +417,8 @@ class _Run:
             raise DatasetError(
                 f"{self.root} has {manifest.sequences} of {self.request.n} sequences; run the same command again."
             )
+        self._clean_up()  # a worker killed in this run left its temp file too
         self.manifest = manifest.save(self.root, dataset_card(manifest))
-        shutil.rmtree(self.root / STAGING, ignore_errors=True)
 
 
 class _Notice:

@@ -174,6 +174,20 @@ def test_leftovers_of_a_killed_run_disappear(reference, tmp_path):
     assert tree(root) == reference[2]
 
 
+def test_leftovers_of_workers_killed_in_this_run_disappear(reference, tmp_path):
+    root = tmp_path / "d"
+
+    def leave_a_temp_file(line):  # the plan is said once the leftovers of earlier runs are gone
+        if " rows, about " in line:
+            (root / "data").mkdir(parents=True)
+            (root / "data" / ".shard-00002.h5.123.part").write_bytes(b"x" * 100)
+            (root / "worlds").mkdir()
+            (root / "worlds" / ".shard-00002.npz.123.part").write_bytes(b"x")
+
+    generate(n=7, out=root, report=leave_a_temp_file, **SMALL)
+    assert tree(root) == reference[2]
+
+
 @pytest.mark.slow
 def test_sigkill_of_the_driver_loses_nothing(reference, tmp_path):
     """Kill the whole run at some moments; the same command then ends with the same bytes."""
