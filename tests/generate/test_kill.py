@@ -72,7 +72,7 @@ def cut_last_files(root, rng):
     files = sorted((p for p in root.rglob("*.h5")), key=lambda p: p.stat().st_mtime_ns)
     for path in files[-2:]:
         if rng.random() < 0.5:
-            path.write_bytes(path.read_bytes()[: rng.randrange(path.stat().st_size)])
+            path.write_bytes(path.read_bytes()[: rng.randrange(path.stat().st_size + 1)])
     (root / "data").mkdir(exist_ok=True)
     (root / "data" / f".shard-00000.h5.{rng.randrange(9999)}.part").write_bytes(b"half")
 
