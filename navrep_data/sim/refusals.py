@@ -59,11 +59,6 @@ REFUSALS: tuple[_Rule, ...] = (
         lambda c: c.physics == "original" and c.rendering == "ellipse",
         "the released software draws legs or trunks; set physics='consistent', or rendering='legs'",
     ),
-    (
-        ("curriculum", "humans", "obstacles"),
-        lambda c: c.curriculum == "adaptive" and c.humans == 0 and c.obstacles == 0,
-        "there is nothing to adapt; ask for humans or obstacles, or set curriculum='constant'",
-    ),
 )
 """(fields, condition, reason with advice) of every combination that is refused."""
 
