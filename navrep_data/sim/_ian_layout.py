@@ -169,9 +169,23 @@ R_WANT_FIELD = 37  # 1: worlds keep the goal field of the first robot, for plann
 R_REDRAWS = 38  # original: how often start and goal are drawn before they count
 R_SPEED_LOW = 39  # preferred speeds of humans that are not planned [m/s]
 R_SPEED_HIGH = 40
-RULE_FIELDS = 41
+R_ELLIPSE = 41  # 1: ellipses in the lidar
+RULE_FIELDS = 42
 
 WALK_PLANNED = 0
 WALK_ORCA = 1
 WALK_STATIC = 2
 WALK_CONSTANT = 3
+
+
+class MapWorldState(NamedTuple):
+    """The worlds of a batch; every array has a leading world axis."""
+
+    agents: NDArray[np.float64]
+    walkers: NDArray[np.float64]
+    contacts: NDArray[np.int8]
+    scalars: NDArray[np.float64]
+    place: NDArray[np.float64]
+    own_field: NDArray[np.float32]
+    rng: NDArray[np.uint64]
+    seeded: NDArray[np.uint64]

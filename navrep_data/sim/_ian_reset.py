@@ -65,9 +65,13 @@ from navrep_data.sim._layout import (
     A_VPREF,
     A_X,
     A_Y,
+    F_NOISE,
     S_EPISODE,
     S_HUMANS,
+    S_NOISE_HIGH,
+    S_NOISE_LOW,
 )
+from navrep_data.sim._noise import noise_key
 from navrep_data.sim._rng import integer, uniform
 
 # pepper_2d_simulator.py: random goals are farther than this from the start [m]
@@ -205,16 +209,18 @@ def _keep_field(agents, walkers, place, own_field, maps, map_row):
 
 @kernel
 def reset_map_world(
-    agents, walkers, contacts, scalars, place, own_field, rng, maps, rules, scenario, heading
+    agents, walkers, contacts, scalars, place, own_field, rng, maps, rules, flags, scenario, heading
 ):  # fmt: skip
     """Start an episode; returns False where no start or goal could be found.
 
     scenario: index, -1: drawn (or random starts and goals where the config has no scenarios). heading: of the robot
     in a scenario [rad], NaN: drawn.
     """
-    episode = scalars[S_EPISODE]
+    episode = scalars[S_EPISODE] + 1.0
     scalars[:] = 0.0
-    scalars[S_EPISODE] = episode + 1.0
+    scalars[S_EPISODE] = episode
+    if flags[F_NOISE]:
+        scalars[S_NOISE_HIGH], scalars[S_NOISE_LOW] = noise_key(rng, episode)
     place[:] = 0.0
     contacts[:, :] = 0
     robots = int(rules[R_ROBOTS])
@@ -227,11 +233,9 @@ def reset_map_world(
     else:
         place[M_SCENARIO] = -1.0
         n_maps = maps.table.shape[0]
-        draws = 1
         if n_maps > 1:
             place[M_MAP] = integer(rng, 0, n_maps)
-            draws = int(rules[R_REDRAWS])
-        for _ in range(draws):
+        for _ in range(int(rules[R_REDRAWS])):
             if not _draw_robots(agents, walkers, maps, maps.table[int(place[M_MAP])], rules, rng):
                 return False
         if rules[R_HUMANS] > 0.0:

@@ -4,10 +4,12 @@
 import numpy as np
 
 from navrep_data._kernels import kernel
-from navrep_data.sim._grid_lidar import QUIRK_MANY, QUIRK_NONE, scan_grid
+from navrep_data.sim._ellipse import body_ellipse, draw_ellipses
+from navrep_data.sim._grid_lidar import QUIRK_MANY, QUIRK_NONE, grid_inverse_ranges, scan_grid
 from navrep_data.sim._ian_contact import body_circles
 from navrep_data.sim._ian_layout import (
     M_MAP,
+    R_ELLIPSE,
     R_LEGS,
     R_ORIGINAL,
     R_ROBOTS,
@@ -28,46 +30,99 @@ from navrep_data.sim._ian_layout import (
     W_SHOWN_X,
     W_SHOWN_Y,
 )
-from navrep_data.sim._layout import A_GX, A_GY, P_ANGLE_INCREMENT, P_ANGLE_MIN, P_RANGE_MAX, S_HUMANS
-from navrep_data.sim._lidar import CIRCLE_OWNER
+from navrep_data.sim._layout import (
+    A_GX,
+    A_GY,
+    A_RADIUS,
+    F_NOISE,
+    P_ANGLE_INCREMENT,
+    P_ANGLE_MIN,
+    P_RANGE_MAX,
+    S_HUMANS,
+)
+from navrep_data.sim._lidar import BEARING_ERROR, CIRCLE_OWNER
+from navrep_data.sim._noise import disturb
+
+TWO_PI = 2.0 * np.pi
+
+
+@kernel
+def other_bodies(i, agents, walkers, robots, n_humans, rules, bodies):
+    """Write what the lidar of robot i sees of the others; returns how many circles or ellipses.
+
+    Owners are the others of robot i: the humans, then the other robots. `bodies` needs two rows per agent.
+    """
+    n = robots + n_humans
+    count = 0
+    if rules[R_ELLIPSE]:
+        for j in range(n):
+            if j != i:
+                x, y, heading = walkers[j, W_SEEN_X], walkers[j, W_SEEN_Y], walkers[j, W_SEEN_HEADING]
+                owner = other_slot(i, j, robots, n_humans)
+                body_ellipse(x, y, heading, agents[j, A_RADIUS], owner, bodies[count])
+                count += 1
+        return count
+    legs = rules[R_LEGS] != 0.0
+    body_circles(agents, walkers, n, legs, bodies)
+    # leave robot i out by moving the rows behind it up; a trunk is drawn once
+    for j in range(n):
+        if j == i:
+            continue
+        for k in range(2 * j, 2 * j + (2 if legs else 1)):
+            bodies[count, 0], bodies[count, 1], bodies[count, 2] = bodies[k, 0], bodies[k, 1], bodies[k, 2]
+            bodies[count, CIRCLE_OWNER] = other_slot(i, j, robots, n_humans)
+            count += 1
+    return count
+
+
+@kernel
+def _scan_ellipses(squares, map_row, bodies, count, x, y, theta, dirs, params, range_max, inverse, owners, hits, out):
+    """Scan a map with ellipses on it."""
+    per_radian = 1.0 / params[P_ANGLE_INCREMENT]
+    zero = (params[P_ANGLE_MIN] - TWO_PI * np.floor(params[P_ANGLE_MIN] / TWO_PI + 0.5)) * per_radian
+    inverse[:] = 1.0 / range_max
+    owners[:] = -1
+    hits[:] = 0
+    grid_inverse_ranges(
+        squares, map_row[T_X0], map_row[T_Y0], map_row[T_RESOLUTION], x, y, theta, dirs, inverse
+    )  # fmt: skip
+    draw_ellipses(
+        bodies, count, x, y, np.cos(theta), np.sin(theta), dirs, inverse, owners, hits, per_radian, zero,
+        TWO_PI * per_radian, BEARING_ERROR * per_radian,
+    )  # fmt: skip
+    for k in range(out.shape[0]):
+        value = 1.0 / inverse[k]
+        out[k] = np.float32(value if value < range_max else range_max)
 
 
 @kernel
 def scan_map_world(
-    i, agents, walkers, scalars, place, maps, rules, circles, dirs, inv_work, owner_work, hits, params, out
+    i, agents, walkers, scalars, place, maps, rules, bodies, dirs, inv_work, owner_work, hits, params, flags, out
 ):  # fmt: skip
-    """Fill out (n_rays,) float32 with the ranges that robot i sees [m], and hits with the rays on each other agent.
-
-    Owners are the others of robot i: the humans, then the other robots.
-    """
+    """Fill out (n_rays,) float32 with the ranges that robot i sees [m], and hits with the rays on each other agent."""
     robots = int(rules[R_ROBOTS])
-    n = robots + int(scalars[S_HUMANS])
+    count = other_bodies(i, agents, walkers, robots, int(scalars[S_HUMANS]), rules, bodies)
     map_row = maps.table[int(place[M_MAP])]
-    legs = rules[R_LEGS] != 0.0
-    body_circles(agents, walkers, n, legs, circles)
-    # leave robot i out, by moving the circles before it up; a trunk is drawn once
-    count = 0
-    for j in range(n):
-        if j == i:
-            continue
-        owner = other_slot(i, j, robots, n - robots)
-        for k in range(2 if legs else 1):
-            circles[count, 0], circles[count, 1] = circles[2 * j + k, 0], circles[2 * j + k, 1]
-            circles[count, 2], circles[count, CIRCLE_OWNER] = circles[2 * j + k, 2], owner
-            count += 1
     width, height = int(map_row[T_WIDTH]), int(map_row[T_HEIGHT])
     start = int(map_row[T_SQUARES])
     squares = maps.squares[start : start + 4 * (width + 1) * (height + 1)].reshape(4, width + 1, height + 1)
     range_max = min(map_row[T_RANGE_MAX], params[P_RANGE_MAX])
     x, y, theta = walkers[i, W_SEEN_X], walkers[i, W_SEEN_Y], walkers[i, W_SEEN_HEADING]
     original = rules[R_ORIGINAL] != 0.0
-    scan_grid(
-        squares, map_row[T_X0], map_row[T_Y0], map_row[T_RESOLUTION], circles, count, x, y, theta, dirs,
-        params[P_ANGLE_MIN], params[P_ANGLE_INCREMENT], range_max, QUIRK_MANY if original else QUIRK_NONE,
-        inv_work, owner_work, hits, out,
-    )  # fmt: skip
+    if rules[R_ELLIPSE]:
+        _scan_ellipses(
+            squares, map_row, bodies, count, x, y, theta, dirs, params, range_max, inv_work, owner_work, hits, out
+        )
+    else:
+        scan_grid(
+            squares, map_row[T_X0], map_row[T_Y0], map_row[T_RESOLUTION], bodies, count, x, y, theta, dirs,
+            params[P_ANGLE_MIN], params[P_ANGLE_INCREMENT], range_max, QUIRK_MANY if original else QUIRK_NONE,
+            inv_work, owner_work, hits, out,
+        )  # fmt: skip
     if not original:
         _see_rim(map_row, width, height, x, y, theta, dirs, out)
+    if flags[F_NOISE]:
+        disturb(scalars, i, params, out)
 
 
 @kernel

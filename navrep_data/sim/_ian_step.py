@@ -54,6 +54,7 @@ from navrep_data.sim._ian_layout import (
     W_LAST_X,
     W_LAST_Y,
     W_LEFT,
+    W_OMEGA,
     W_START_HEADING,
     W_START_X,
     W_START_Y,
@@ -76,12 +77,17 @@ from navrep_data.sim._ian_orca import choose_orca
 from navrep_data.sim._ian_plan import at_goal, follow_tasks, give_tasks, limit_command
 from navrep_data.sim._judge import COLLISION_HUMAN, COLLISION_OBSTACLE, GOAL, NONE, TIMEOUT
 from navrep_data.sim._layout import (
+    A_CLEAR_HUMAN,
+    A_CLEAR_STATIC,
+    A_DAMAGE,
+    A_EVENT,
     A_GAIT_T,
     A_GAIT_X,
     A_GAIT_Y,
     A_GX,
     A_GY,
     A_HEADING,
+    A_OMEGA,
     A_RADIUS,
     A_VX,
     A_VY,
@@ -89,6 +95,7 @@ from navrep_data.sim._layout import (
     A_Y,
     S_CLEAR_HUMAN,
     S_CLEAR_STATIC,
+    S_EVENT,
     S_HUMANS,
     S_STEP,
     S_TIME,
@@ -325,7 +332,11 @@ def step_map_world(
         spin = actions[i, 2] / rules[R_MAX_VX + 2]
         rewards[i] = _reward(agents, walkers, scalars, i, event, spin, human, static, rules)
         events[i] = event
+        agents[i, A_EVENT], agents[i, A_DAMAGE] = event, walkers[i, W_DAMAGE]
+        agents[i, A_CLEAR_HUMAN], agents[i, A_CLEAR_STATIC] = human, static
+        agents[i, A_OMEGA] = walkers[i, W_OMEGA]
     remember(agents, walkers, n)
     scalars[S_TIME] = time + rules[R_DT]
+    scalars[S_EVENT] = joint_event(events, robots)
     if rules[R_HUMAN_POLICY] == WALK_PLANNED and n > robots:
         _send_back(agents, walkers, contacts, robots, n, original)
