@@ -279,9 +279,7 @@ def check_way(
         )
 
 
-def _edges(
-    maps: tuple[GridMap, ...], table: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def _edges(maps: tuple[GridMap, ...], table: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     outlines = [grid.contours(CONTOUR_TOLERANCE) for grid in maps]
     capacity = max([1, *(sum(map(len, lines)) for lines in outlines)])
     edges_f = np.zeros((len(maps), OF_FIELDS, capacity), np.float32)

@@ -223,7 +223,9 @@ class Simulator:
         if headings is not None:
             fixed = np.asarray(headings, np.float64)
             if fixed.shape != (self.n_worlds,) or not np.isfinite(fixed[chosen]).all():
-                raise ConfigError(f"headings have shape {fixed.shape}, expected ({self.n_worlds},) finite angles [rad].")
+                raise ConfigError(
+                    f"headings have shape {fixed.shape}, expected ({self.n_worlds},) finite angles [rad]."
+                )
         if numpy_seeds is None:
             self.maps.reset(chosen, self.arrays.rng, scenarios=indices, headings=fixed)
         else:
