@@ -141,7 +141,12 @@ def original_path(field, start, random_state=None):
     for the rest of the path and forbids the diagonals beside it, except up-right.
     """
     straight = {"up": (0, 1), "right": (1, 0), "down": (0, -1), "left": (-1, 0)}
-    diagonal = {("up", "right"): (1, 1), ("down", "right"): (1, -1), ("up", "left"): (-1, 1), ("down", "left"): (-1, -1)}
+    diagonal = {
+        ("up", "right"): (1, 1),
+        ("down", "right"): (1, -1),
+        ("up", "left"): (-1, 1),
+        ("down", "left"): (-1, -1),
+    }
     path, shut = [start], set()
     while True:
         i, j = path[-1]
