@@ -185,7 +185,9 @@ def generate(
     root = Path(out) if out is not None else Path("data") / env
     settings = check_settings(config, length, scan_dtype, rings, humans_column)
     request = make_request(root, config, settings, chosen, seed, n, shard_size, "")
-    request = replace(request, command=_command(request, env, physics, humans, obstacles, legs, maps, shard_size, scan_dtype))
+    request = replace(
+        request, command=_command(request, env, physics, humans, obstacles, legs, maps, shard_size, scan_dtype)
+    )
     existed = root.exists()
     try:
         check_folder(root)

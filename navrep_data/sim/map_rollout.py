@@ -16,6 +16,7 @@ from navrep_data.sim.config import SimConfig
 from navrep_data.sim.map_worlds import MapWorlds
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
 from navrep_data.sim.rollout import (
+    _STATE,
     CallableRollout,
     PolicyFunction,
     RolloutSettings,
@@ -23,7 +24,6 @@ from navrep_data.sim.rollout import (
     SequenceRows,
     _columns,
     _Outputs,
-    _STATE,
     _worlds,
 )
 from navrep_data.sim.simulator import check_seed

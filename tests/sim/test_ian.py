@@ -67,7 +67,7 @@ def test_a_collision_in_the_first_step_puts_back_to_the_start() -> None:
         start = simulator.state().robot[:2].copy()
         # a human is put in the robot's way
         agents, walkers = simulator.arrays.agents[0], simulator.arrays.worlds.walkers[0]
-        agents[1, [lay.A_X, lay.A_Y]] = start + [0.45, 0.0]
+        agents[1, [lay.A_X, lay.A_Y]] = start + np.array([0.45, 0.0])
         walkers[1, :] = 0.0
         simulator.step(np.array([[0.55, 0.0, 0.0]]))
         assert simulator.damage()[0, 0] == pytest.approx(0.55)
@@ -116,7 +116,9 @@ def test_time_limit(physics: str) -> None:
 def test_goal_and_its_reward(physics: str) -> None:
     """rlasl1 is a straight way: 100 discounted by the time, a twentieth of a hundredth per metre before."""
     simulator = one(physics, "rlasl1", 0.0)
-    for steps in range(1, 200):
+    steps = 0
+    while steps < 200:
+        steps += 1
         robot = simulator.state().robot
         to_goal = robot[3:5] - robot[:2]
         command = np.append(to_goal / np.hypot(*to_goal) * 0.55, 0.0)
@@ -156,8 +158,10 @@ def test_commands_are_limited() -> None:
 
 def play(simulator: Simulator, steps: int) -> list[np.ndarray]:
     rng = np.random.default_rng(5)
-    commands = rng.uniform(-0.5, 0.5, (steps, 3)) + [0.3, 0.0, 0.0]
-    shape = (simulator.n_worlds, 3) if simulator.config.robots == 1 else (simulator.n_worlds, simulator.config.robots, 3)
+    commands = rng.uniform(-0.5, 0.5, (steps, 3)) + np.array([0.3, 0.0, 0.0])
+    shape = (
+        (simulator.n_worlds, 3) if simulator.config.robots == 1 else (simulator.n_worlds, simulator.config.robots, 3)
+    )
     seen = []
     for command in commands:
         reward, event = simulator.step(np.broadcast_to(command, shape))

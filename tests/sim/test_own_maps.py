@@ -109,7 +109,7 @@ def test_lidar_and_robot_meet_the_same_rim(tmp_path: Path) -> None:
 def test_a_map_without_room_is_refused(tmp_path: Path) -> None:
     grey = np.full((40, 40), FREE)
     grey[::4] = SOLID
-    with pytest.raises(MapError, match="has no place that is 0.5 m from all walls"):
+    with pytest.raises(MapError, match=r"has no place that is 0\.5 m from all walls"):
         Simulator(make_config("map", maps=(write_map(tmp_path / "full", grey),), humans=0))
 
 
