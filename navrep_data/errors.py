@@ -74,6 +74,10 @@ class SimulationError(NavrepDataError, RuntimeError):
     """The simulator reached a state that it cannot go on from."""
 
 
+class DisplayError(NavrepDataError, RuntimeError):
+    """Something needs a window or a program that is not here."""
+
+
 class WorkerDiedError(NavrepDataError, RuntimeError):
     """A worker process ended without a result."""
 

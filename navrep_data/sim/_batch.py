@@ -19,6 +19,16 @@ def seed_worlds(rng, scalars, seed, first_sequence):
 
 
 @kernel
+def seed_streams(rng, scalars, seeds, mask):
+    """Give the worlds of `mask` the streams (seeds[w], 0) and forget their episodes."""
+    for w in range(rng.shape[0]):
+        if mask[w]:
+            seed_philox(rng[w], seeds[w], 0)
+            scalars[w, :] = 0.0
+            scalars[w, S_EPISODE] = -1.0
+
+
+@kernel
 def seed_legacy(rng, seeds, mask):
     """Give the worlds of `mask` the streams of ``numpy.random.RandomState(seeds[w])``."""
     for w in range(rng.shape[0]):
@@ -59,10 +69,12 @@ def step_worlds(
 
 @kernel
 def observe_worlds(
-    agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, scans, states
+    mask, agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, scans, states
 ):  # fmt: skip
-    """Fill scans (W, rays) [m] and robot states (W, 5) of all worlds."""
+    """Fill scans (W, rays) [m] and robot states (W, 5) of the worlds of `mask`; the others' rows stay."""
     for w in range(agents.shape[0]):
+        if not mask[w]:
+            continue
         observe_scan(
             agents[w], scalars[w], edges[w], polygon_start[w], circles, dirs, inv_work, owner_work, hits[w],
             params, flags, scans[w],

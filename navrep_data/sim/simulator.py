@@ -174,6 +174,33 @@ class Simulator:
         _batch.seed_legacy(streams, np.where(chosen, seeds, 0).astype(np.uint64), chosen)
         self._reset(chosen, streams)
 
+    def reset_streams(self, seeds: ArrayLike, mask: ArrayLike | None = None) -> None:
+        """Start anew with other random streams, in all worlds or in those of `mask` (W,).
+
+        World w then plays the episodes of ``Simulator(config, seed=seeds[w])``, whatever it played before.
+
+        Parameters
+        ----------
+        seeds : array_like of shape (W,)
+            Whole numbers from 0 to 2^63 - 1; those outside `mask` are not used.
+        mask : array_like of shape (W,), optional
+            Which worlds.
+
+        Raises
+        ------
+        ConfigError
+            If a shape or a seed is wrong.
+        """
+        chosen = self._mask(mask)
+        values = np.asarray(seeds)
+        if values.shape != (self.n_worlds,) or values.dtype.kind not in "iu":
+            raise ConfigError(
+                f"seeds have shape {values.shape}, dtype {values.dtype}, expected ({self.n_worlds},) whole numbers."
+            )
+        keys = np.array([check_seed(int(v)) if c else 0 for v, c in zip(values, chosen, strict=True)], np.uint64)
+        _batch.seed_streams(self.arrays.rng, self.arrays.scalars, keys, chosen)
+        self._reset(chosen, self.arrays.rng)
+
     def _mask(self, mask: ArrayLike | None) -> NDArray[np.bool_]:
         chosen = np.ones(self.n_worlds, np.bool_) if mask is None else np.asarray(mask, np.bool_)
         if chosen.shape != (self.n_worlds,):
@@ -217,15 +244,16 @@ class Simulator:
         )  # fmt: skip
         return rewards, events
 
-    def observe(self) -> tuple[F32, F32]:
+    def observe(self, mask: ArrayLike | None = None) -> tuple[F32, F32]:
         """Return scans (W, n_rays) [m] and robot states (W, 5), both float32, of the present state.
 
-        Robot state: goal x, goal y [m], vx, vy [m/s], omega [rad/s] in the robot frame.
+        Robot state: goal x, goal y [m], vx, vy [m/s], omega [rad/s] in the robot frame. With a `mask` (W,) only its
+        worlds are observed: in the other rows the scan is the one before, the robot state 0.
         """
         a = self.arrays
         states = np.zeros((self.n_worlds, ROBOT_STATE_SIZE), np.float32)
         _batch.observe_worlds(
-            a.agents, a.scalars, a.edges, a.polygon_start, a.circles, a.dirs, a.inv_work, a.owner_work, a.hits,
+            self._mask(mask), a.agents, a.scalars, a.edges, a.polygon_start, a.circles, a.dirs, a.inv_work, a.owner_work, a.hits,
             a.params, a.flags, a.scans, states,
         )  # fmt: skip
         return a.scans.copy(), states
