@@ -1,5 +1,6 @@
 """Gymnasium environments over the simulator, single and vectorised (gymnasium and numpy, no torch)."""
 
+from navrep_data.envs.playing import play
 from navrep_data.envs.recording import Recording, goal_policy, record
 from navrep_data.envs.single import NavRepEnv
 from navrep_data.envs.vector import NavRepVectorEnv
@@ -25,6 +26,7 @@ __all__ = [
     "VectorScan1dObservation",
     "goal_policy",
     "gymnasium_id",
+    "play",
     "record",
     "register",
 ]

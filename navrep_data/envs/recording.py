@@ -154,8 +154,8 @@ def _as_callable(policy: Any) -> Policy:
         policy.reset(batch_size=1)
 
     def act(observation: dict[str, Any]) -> NDArray[Any]:
-        actions = policy.act(observation["scan"][None], observation["robot_state"][None])
-        return np.asarray(actions)[0]
+        actions = np.asarray(policy.act(observation["scan"][None], observation["robot_state"][None]))
+        return actions[0, ...]
 
     return act
 
@@ -174,7 +174,7 @@ def write_gif(path: Path, frames: list[NDArray[np.uint8]], seconds: float) -> No
 def _need_ffmpeg() -> Any:
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise DisplayError(
-            "MP4 needs imageio-ffmpeg, which is not installed: pip install imageio-ffmpeg, or give a name ending in .gif."
+            "MP4 needs imageio-ffmpeg, which is not installed: pip install imageio-ffmpeg, or write a .gif."
         )
     return importlib.import_module("imageio_ffmpeg")
 

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from navrep_data.envs.window import Window, available_render_modes, check_render_mode
 from navrep_data.envs.worlds import (
     EVENT_LABELS,
-    TERMINAL,
     F64,
+    TERMINAL,
     Observation,
     Worlds,
     action_space,
@@ -208,7 +208,7 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self._camera = Camera.around(state)
         return draw_frame(state, self._camera, self._scan, self.config.sensor, self._trail, size)
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Return a picture (480, 480, 3), uint8, in mode ``"rgb_array"``; draw the window in mode ``"human"``."""
         if self.render_mode == "rgb_array":
             return self.frame()

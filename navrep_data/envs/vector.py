@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from navrep_data.envs.window import check_render_mode
 from navrep_data.envs.worlds import (
     EVENT_LABELS,
-    TERMINAL,
     F64,
+    TERMINAL,
     Mask,
     Observation,
     Worlds,
@@ -57,7 +57,7 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
     truncations (N,) bool. ``infos`` follow gymnasium's convention, ``_key`` (N,) bool saying for whom a value holds:
     ``robot`` (N, 3), ``humans`` (N, most humans, 4) with NaN in empty slots, ``event`` (N,) str, ``seed`` (N,) where
     episodes are numbered. Where episodes ended, ``final_obs`` (N,) holds their last observations (None elsewhere) and
-    ``final_info`` the infos of their last steps, ``event`` with the reason; the observation is that of the next episode.
+    ``final_info`` the infos of their last steps, with the reason; observations are those of the next episodes.
 
     ``reset(options={"reset_mask": mask})`` resets some worlds only.
     """

@@ -27,7 +27,8 @@ def has_display() -> bool:
     import matplotlib.pyplot as plt
     from matplotlib.backends.registry import BackendFilter, backend_registry
 
-    interactive = {name.lower() for name in backend_registry.list_builtin(BackendFilter.INTERACTIVE)}
+    registry: Any = backend_registry
+    interactive = {name.lower() for name in registry.list_builtin(BackendFilter.INTERACTIVE)}
     # asking pyplot makes it try what is installed
     return plt.get_backend().lower() in interactive
 
@@ -112,20 +113,21 @@ class Window:
         if on_close is not None:
             self.figure.canvas.mpl_connect("close_event", lambda event: on_close())
 
-    def show(self, picture: NDArray[np.uint8], title: str | None = None) -> None:
+    def show(self, picture: NDArray[np.uint8]) -> None:
         """Show a picture (h, w, 3), uint8, and handle what the user has done."""
         if self._image is None:
             self._image = self._axes.imshow(picture)
+            if has_display():
+                self.figure.show()
         else:
             self._image.set_data(picture)
-        if title is not None and self.figure.canvas.manager is not None:
-            self.figure.canvas.manager.set_window_title(title)
-        self.figure.canvas.draw_idle()
+        self.figure.canvas.draw()
+        self.wait(0.0)
+
+    def wait(self, seconds: float) -> None:
+        """Handle keys and the window's own events for so many seconds."""
         if has_display():
-            self.figure.show()
-            self.figure.canvas.start_event_loop(_BLINK)
-        else:
-            self.figure.canvas.draw()
+            self.figure.canvas.start_event_loop(max(seconds, _BLINK))
 
     def close(self) -> None:
         """Close the window."""

@@ -35,7 +35,7 @@ def make_env_config(env: str | SimConfig, **changes: Any) -> SimConfig:
     return make_config(env, **changes)
 
 
-def observation_space(config: SimConfig) -> gymnasium.spaces.Dict:
+def observation_space(config: SimConfig) -> Any:
     """Return Dict(scan, robot_state): ranges in [0, range_max], the state within bounds that no robot leaves."""
     low, high = state_bounds(config)
     shape = lead(config)
@@ -45,7 +45,7 @@ def observation_space(config: SimConfig) -> gymnasium.spaces.Dict:
     )
 
 
-def action_space(config: SimConfig) -> gymnasium.spaces.Box:
+def action_space(config: SimConfig) -> Any:
     """Return Box(-1, 1, (3,)): shares of the robot's largest velocities."""
     return gymnasium.spaces.Box(-1.0, 1.0, (*lead(config), ACTION_SIZE), np.float32)
 
@@ -107,6 +107,8 @@ class Worlds:
         self._next = first + np.arange(n)
         self._plain = np.zeros(n, np.bool_)
         self._fresh = np.ones(n, np.bool_)  # streams that nobody has seeded yet
+        self._restarts = np.zeros(n, np.bool_)  # streams that start anew at the next reset, with these seeds
+        self._streams = np.zeros(n, np.int64)
         self.seeds = np.zeros(n, np.int64)  # numpy seeds of the present episodes
         self.events = np.zeros(n, np.uint8)
 
@@ -138,8 +140,9 @@ class Worlds:
             return
         given = np.array([seed is not None for seed in seeds])
         if self.numbered:
-            for i in np.flatnonzero(given):
-                self._next[i] = _whole("seed", seeds[i], MAX_NUMPY_SEED)
+            for i, seed in enumerate(seeds):
+                if seed is not None:
+                    self._next[i] = _whole("seed", seed, MAX_NUMPY_SEED)
             self._plain |= given
         else:
             self._reseed(seeds, given, random)
@@ -149,15 +152,13 @@ class Worlds:
         if not (given | fresh).any():
             return
         keys = np.zeros(self.n, np.int64)
-        for i in np.flatnonzero(given):
-            keys[i] = _whole("seed", seeds[i], MAX_SEED)
+        for i, seed in enumerate(seeds):
+            if seed is not None:
+                keys[i] = _whole("seed", seed, MAX_SEED)
         keys[fresh] = random.integers(0, MAX_SEED, int(fresh.sum()))
-        self._streams = keys
-        self._restarts = given | fresh
+        self._streams[given | fresh] = keys[given | fresh]
+        self._restarts |= given | fresh
         self._fresh[self._restarts] = False
-
-    _restarts: Mask | None = None
-    _streams: NDArray[np.int64]
 
     def restart(self, mask: Mask) -> None:
         """Start the next episode in the worlds of `mask`."""
@@ -169,16 +170,16 @@ class Worlds:
             self._next[mask] += self.n
             self.sim.reset_seeded(self.seeds, mask)
             return
-        reseeded = None if self._restarts is None else mask & self._restarts
-        if reseeded is not None and reseeded.any():
-            self.sim.reset_streams(self._streams, reseeded)
-            self._restarts = self._restarts & ~reseeded
-            mask = mask & ~reseeded
+        anew = mask & self._restarts
+        if anew.any():
+            self.sim.reset_streams(self._streams, anew)
+            self._restarts &= ~anew
+            mask = mask & ~anew
         if mask.any():
             self.sim.reset(mask)
 
     def step(self, actions: ArrayLike) -> F64:
-        """Advance all worlds under actions in [-1, 1], (n, 3) or (n, robots, 3); returns rewards, sets :attr:`events`."""
+        """Advance all under actions in [-1, 1], (n, 3) or (n, robots, 3); returns rewards, sets :attr:`events`."""
         commands = np.asarray(actions, np.float64)
         if commands.shape != (self.n, *self._lead, ACTION_SIZE):
             raise ConfigError(f"action has shape {commands.shape[1:]}, expected {(*self._lead, ACTION_SIZE)}.")

@@ -18,11 +18,14 @@ F64 = NDArray[np.float64]
 
 BACKGROUND = "#ffffff"
 SEEN = "#fdf3dd"
+RAY_LINE = "#f8e2b4"
 LEG = "#16425b"
 BODY = "#a9cfe3"
 # Drawn this much larger and averaged: pillow's lines and circles have hard edges.
 _OVERSAMPLING = 2
 _MARGIN = 0.5
+# About so many rays are drawn as lines; all of them would hide the rest.
+_RAY_LINES = 36
 _LEAST_HALF = 3.0
 _MIN_SIZE, _MAX_SIZE = 16, 4096
 _STAR = np.array([[np.sin(k * np.pi / 5), np.cos(k * np.pi / 5)] for k in range(10)]) * np.where(
@@ -171,6 +174,8 @@ def draw_frame(
     ]
     for points, robot in zip(ends, robots, strict=True):
         canvas.polygon(points if sensor.covers_full_turn() else np.vstack([robot[:2], points]), fill=SEEN)
+        for end in points[:: max(1, len(points) // _RAY_LINES)]:
+            canvas.line([robot[:2], end], RAY_LINE, 0.5)
     for corners in state.polygons:
         solid = _area(corners) > 0.0
         canvas.polygon(corners, fill=OBSTACLE if solid else None, line=OBSTACLE, width=1.5)

@@ -253,8 +253,8 @@ class Simulator:
         a = self.arrays
         states = np.zeros((self.n_worlds, ROBOT_STATE_SIZE), np.float32)
         _batch.observe_worlds(
-            self._mask(mask), a.agents, a.scalars, a.edges, a.polygon_start, a.circles, a.dirs, a.inv_work, a.owner_work, a.hits,
-            a.params, a.flags, a.scans, states,
+            self._mask(mask), a.agents, a.scalars, a.edges, a.polygon_start, a.circles, a.dirs, a.inv_work,
+            a.owner_work, a.hits, a.params, a.flags, a.scans, states,
         )  # fmt: skip
         return a.scans.copy(), states
 
