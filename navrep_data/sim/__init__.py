@@ -1,8 +1,9 @@
 """NavRepSim: worlds, humans, lidar and robot, for many independent worlds at once."""
 
+from navrep_data.sim.actions import scale_actions
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
-from navrep_data.sim.registry import describe_environment, environment_names, make_config, numpy_seed
+from navrep_data.sim.registry import describe_environment, environment_names, gymnasium_id, make_config, numpy_seed
 from navrep_data.sim.rollout import (
     CallableRollout,
     PolicyFunction,
@@ -26,7 +27,9 @@ __all__ = [
     "check_seed",
     "describe_environment",
     "environment_names",
+    "gymnasium_id",
     "make_config",
     "numpy_seed",
+    "scale_actions",
     "warm_up",
 ]

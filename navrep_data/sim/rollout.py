@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from navrep_data.errors import PolicyError, SimulationError
+from navrep_data.errors import ConfigError, PolicyError, SimulationError
 from navrep_data.observations import scan_to_rings
 from navrep_data.schema import ACTION_SIZE, HUMAN_FIELDS, RINGS_SHAPE, Event
 from navrep_data.sim import _layout as lay
@@ -52,7 +52,7 @@ class _Outputs:
     """Room for the rows of a batch of sequences; reused from batch to batch."""
 
     def __init__(self, config: SimConfig, settings: RolloutSettings, n: int) -> None:
-        length, crowd = settings.length, config.max_humans
+        length, crowd = settings.length, config.max_others
         # every row may start an episode (a policy can give up at once), so tables grow only up to this
         starts = length
         self.scan = np.zeros((n, length, config.sensor.n_rays), settings.scan_dtype)
@@ -136,7 +136,8 @@ class ScriptedRollout:
     settings : RolloutSettings
         Length and columns.
     policy : ScriptedPolicy
-        The robot's policy.
+        The robot's policy. Where there are several robots it drives them all; rows are those of the first, and the
+        others are listed after the humans.
     seed : int
         The dataset's seed; sequence i draws from the stream (seed, i) alone.
     """
@@ -189,6 +190,11 @@ class CallableRollout:
     def __init__(
         self, config: SimConfig, settings: RolloutSettings, policy: PolicyFunction, seed: int, batch: int = 64
     ) -> None:
+        if config.robots > 1:
+            raise ConfigError(
+                f"robots={config.robots} with a Python policy: it drives one robot; set robots=1, or take a scripted "
+                f"policy, which drives all ({', '.join(SCRIPTED)})."
+            )
         self.config = config
         self.settings = settings
         self.policy = policy
@@ -215,7 +221,7 @@ class CallableRollout:
             raise _no_world(a.config, sequences[0])
         pending = np.zeros(n, np.int64)
         gave_up = np.zeros(n, np.bool_)
-        result = np.zeros(2)
+        result = np.zeros(2)  # reward and event of one robot
         length = self.settings.length
         reset = getattr(self.policy, "reset", None)
         if reset is not None:
@@ -260,7 +266,25 @@ class CallableRollout:
         return np.concatenate([rows, np.repeat(rows[:1], missing, axis=0)])
 
 
+def check_rings(config: SimConfig, rings: bool) -> None:
+    """Refuse the rings column for a sensor that does not look once around, starting straight ahead.
+
+    Raises
+    ------
+    ConfigError
+        Naming the sensor's fields.
+    """
+    sensor = config.sensor
+    if rings and not (sensor.covers_full_turn() and abs(sensor.angle_min) <= sensor.angle_increment):
+        span = np.rad2deg(sensor.n_rays * sensor.angle_increment)
+        raise ConfigError(
+            f"rings=True with sensor.n_rays={sensor.n_rays} over {span:.0f} degrees from sensor.angle_min="
+            f"{sensor.angle_min:g}: rings need rays once around from straight ahead; leave the column out (--no-rings)."
+        )
+
+
 def _prepare(arrays: WorldArrays, settings: RolloutSettings) -> None:
+    check_rings(arrays.config, settings.rings)
     arrays.flags[lay.F_SCAN_MM] = settings.scan_dtype == "uint16"
     arrays.flags[lay.F_WANT_HUMANS] = settings.humans
 
