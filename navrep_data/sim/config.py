@@ -14,6 +14,7 @@ from navrep_data.errors import ConfigError, did_you_mean
 from navrep_data.schema import SensorContract
 from navrep_data.sim import _layout as lay
 from navrep_data.sim.refusals import check_combinations
+from navrep_data.sim.scenarios import get_scenario
 
 PHYSICS = ("consistent", "original")
 CROSSINGS = ("circle", "square")
@@ -157,7 +158,9 @@ class SimConfig:
 
     @property
     def max_humans(self) -> int:
-        """Largest number of humans that an episode can have: round(1.5 x humans)."""
+        """Largest number of humans that an episode can have: round(1.5 x humans), or those of the scenarios."""
+        if self.scenarios:
+            return max(get_scenario(name).humans for name in self.scenarios)
         return round(self.humans * 1.5)
 
     @property

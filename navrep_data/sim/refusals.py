@@ -34,6 +34,42 @@ REFUSALS: tuple[_Rule, ...] = (
         "a map world needs a map; name one in maps, or a scenario in scenarios",
     ),
     (
+        ("maps", "scenarios"),
+        lambda c: bool(c.maps) and bool(c.scenarios),
+        "scenarios name their maps themselves; leave one of the two empty",
+    ),
+    (
+        ("scenarios", "humans"),
+        lambda c: bool(c.scenarios) and c.humans > 0,
+        "scenarios say who is there; set humans=0, or leave scenarios empty and name maps",
+    ),
+    (
+        ("scenarios", "robots"),
+        lambda c: bool(c.scenarios) and c.robots > 1,
+        "scenarios have one robot; set robots=1, or leave scenarios empty and name maps",
+    ),
+    (
+        ("world", "obstacles"),
+        lambda c: c.world == "map" and c.obstacles > 0,
+        "a map world has its map's obstacles only; set obstacles=0, or world='polygons'",
+    ),
+    (
+        ("physics", "world", "human_policy"),
+        lambda c: c.physics == "original" and c.world == "map" and c.human_policy != "planned",
+        "the released software's humans on maps are planned; set physics='consistent', or human_policy='planned'",
+    ),
+    (
+        ("physics", "world", "scenarios", "humans"),
+        lambda c: c.physics == "original" and c.world == "map" and not c.scenarios and c.humans > 0,
+        "the released software has humans on maps only in scenarios; set physics='consistent', or humans=0",
+    ),
+    (
+        ("physics", "world", "robots", "on_collision"),
+        lambda c: c.physics == "original" and c.world == "map" and c.robots > 1 and c.on_collision == "damage",
+        "every collision of one robot ends the episode of all in the released software; set physics='consistent', or "
+        "on_collision='end'",
+    ),
+    (
         ("world", "human_policy"),
         lambda c: c.world != "map" and c.human_policy == "planned",
         "planned humans walk on a map; set world='map', or human_policy='orca'",

@@ -8,6 +8,7 @@ import numpy as np
 
 from navrep_data.errors import ConfigError, UnknownNameError, did_you_mean
 from navrep_data.sim.config import SimConfig
+from navrep_data.sim.map_environments import MAP_ENVIRONMENTS, original_fields
 
 _ENVIRONMENTS: dict[str, tuple[str, dict[str, Any]]] = {
     "soadrl": (
@@ -35,6 +36,8 @@ _ENVIRONMENTS: dict[str, tuple[str, dict[str, Any]]] = {
         {"world": "empty", "humans": 0, "obstacles": 0},
     ),
 }
+
+_ENVIRONMENTS |= MAP_ENVIRONMENTS
 
 # gymnasium's ids are CamelCase with a version; these words are spelled otherwise than by capitals alone
 _SPELLED = {"navrep": "NavRep", "soadrl": "SOADRL", "cadrl": "CADRL", "ian": "IAN", "crowdmove": "CrowdMove"}
@@ -124,5 +127,7 @@ def make_config(env: str = "soadrl", **changes: Any) -> SimConfig:
         If a field is unknown or has a wrong value.
     """
     fields = _lookup(env)[1]
+    if changes.get("physics") == "original":
+        fields = fields | original_fields(env)
     wanted = {name: value for name, value in changes.items() if value is not None}
     return SimConfig(env=env, **fields).replace(**wanted)

@@ -20,6 +20,7 @@ from navrep_data.sim._obstacles import OF_FIELDS, OI_FIELDS
 from navrep_data.sim._orca import make_orca_work
 from navrep_data.sim.config import SimConfig, kernel_flags, kernel_params, orca_params
 from navrep_data.sim.lidar import ray_directions
+from navrep_data.sim.map_worlds import MapWorlds
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -47,8 +48,6 @@ class WorldArrays:
     """The packed state of a batch of worlds and the scratch space of the kernels; see ``_layout`` for the columns."""
 
     def __init__(self, config: SimConfig, n_worlds: int) -> None:
-        if config.world == "map":
-            raise ConfigError("world='map' cannot be simulated by this version; set world='polygons' or 'empty'.")
         robots = config.robots
         agents = config.max_humans + robots
         polygons = config.max_polygons
@@ -150,7 +149,8 @@ class Simulator:
             raise ConfigError(f"n_worlds is {n_worlds!r}, expected at least 1.")
         self.config = config
         self.n_worlds = n_worlds
-        self.arrays = WorldArrays(config, n_worlds)
+        self.maps = MapWorlds(config, n_worlds) if config.world == "map" else None
+        self.arrays: Any = WorldArrays(config, n_worlds) if self.maps is None else self.maps.arrays
         _batch.seed_worlds(self.arrays.rng, self.arrays.scalars, check_seed(seed), check_seed(first_sequence))
         self.reset()
 
@@ -185,6 +185,53 @@ class Simulator:
                 "curriculum='constant'."
             )
         chosen = self._mask(mask)
+        self._reset(chosen, self._legacy_streams(numpy_seeds, chosen), seeded=True)
+
+    def reset_scenarios(
+        self,
+        scenarios: ArrayLike,
+        numpy_seeds: ArrayLike | None = None,
+        mask: ArrayLike | None = None,
+        headings: ArrayLike | None = None,
+    ) -> None:
+        """Start episodes of given scenarios, in all worlds or in those of `mask` (W,).
+
+        Parameters
+        ----------
+        scenarios : array_like of shape (W,)
+            Names, or indices into the config's scenarios; those outside `mask` are checked, too.
+        numpy_seeds : array_like of shape (W,), optional
+            As for :meth:`reset_seeded`: first the robot's start heading is drawn, then what the episode needs. Without
+            them the worlds' own streams are drawn from. Suite ``navrep27``: round r of scenario i has seed 27 r + i.
+        mask : array_like of shape (W,), optional
+            Which worlds.
+        headings : array_like of shape (W,), optional
+            The robots' start headings [rad], instead of drawing them.
+
+        Raises
+        ------
+        ConfigError
+            If the environment has no scenarios, or a shape, index or seed is wrong.
+        UnknownNameError
+            If there is no scenario of that name.
+        """
+        if self.maps is None:
+            raise ConfigError(f"Environment {self.config.env!r} has no scenarios; take env='ian', or plain reset().")
+        chosen = self._mask(mask)
+        indices = self.maps.scenario_indices(scenarios)
+        fixed = None
+        if headings is not None:
+            fixed = np.asarray(headings, np.float64)
+            if fixed.shape != (self.n_worlds,) or not np.isfinite(fixed[chosen]).all():
+                raise ConfigError(f"headings have shape {fixed.shape}, expected ({self.n_worlds},) finite angles [rad].")
+        if numpy_seeds is None:
+            self.maps.reset(chosen, self.arrays.rng, scenarios=indices, headings=fixed)
+        else:
+            streams = self._legacy_streams(numpy_seeds, chosen)
+            self.maps.reset(chosen, streams, seeded=True, scenarios=indices, headings=fixed)
+
+    def _legacy_streams(self, numpy_seeds: ArrayLike, chosen: NDArray[np.bool_]) -> NDArray[np.uint64]:
+        """Return the streams of numpy's legacy generators with these seeds."""
         seeds = np.asarray(numpy_seeds)
         if seeds.shape != (self.n_worlds,) or seeds.dtype.kind not in "iu":
             raise ConfigError(
@@ -194,7 +241,7 @@ class Simulator:
             raise ConfigError(f"numpy_seeds are {seeds.tolist()}, expected whole numbers from 0 to {MAX_NUMPY_SEED}.")
         streams = np.zeros_like(self.arrays.rng)
         _batch.seed_legacy(streams, np.where(chosen, seeds, 0).astype(np.uint64), chosen)
-        self._reset(chosen, streams)
+        return streams
 
     def restart(self, seeds: ArrayLike, mask: ArrayLike | None = None) -> None:
         """Give worlds new streams, forget their episodes, and start the first one.
@@ -231,8 +278,11 @@ class Simulator:
             raise ConfigError(f"mask has shape {chosen.shape}, expected ({self.n_worlds},).")
         return chosen
 
-    def _reset(self, chosen: NDArray[np.bool_], streams: NDArray[np.uint64]) -> None:
+    def _reset(self, chosen: NDArray[np.bool_], streams: NDArray[np.uint64], *, seeded: bool = False) -> None:
         a = self.arrays
+        if self.maps is not None:
+            self.maps.reset(chosen, streams, seeded=seeded)
+            return
         if not _batch.reset_worlds(
             chosen, a.agents, a.agents32, a.scalars, a.vertices, a.polygon_start, a.edges, a.obst_f, a.obst_i, a.boxes,
             streams, a.params, a.flags, a.orca_params, a.work_f, a.work_i, a.moves,
@@ -263,6 +313,9 @@ class Simulator:
             raise ConfigError("actions hold NaN or infinity, expected finite velocities.")
         rewards = np.zeros((self.n_worlds, self.config.robots))
         events = np.zeros(self.n_worlds, np.uint8)
+        if self.maps is not None:
+            self.maps.step(commands.reshape(*rewards.shape, ACTION_SIZE), rewards, events)
+            return rewards.reshape(self.n_worlds, *self._per_robot), events
         _batch.step_worlds(
             commands.reshape(self.n_worlds, -1), a.agents, a.agents32, a.scalars, a.edges, a.polygon_start, a.boxes,
             a.obst_f, a.obst_i, a.params, a.flags, a.orca_params, a.work_f, a.work_i, a.moves, rewards, events,
@@ -283,11 +336,14 @@ class Simulator:
         """
         a = self.arrays
         per_robot = (self.n_worlds, *self._per_robot)
-        states = np.zeros((self.n_worlds * self.config.robots, ROBOT_STATE_SIZE), np.float32)
-        _batch.observe_worlds(
-            self._mask(mask), a.agents, a.scalars, a.edges, a.polygon_start, a.circles, a.dirs, a.inv_work,
-            a.owner_work, a.hits, a.params, a.flags, a.scans, states,
-        )  # fmt: skip
+        if self.maps is not None:
+            states = self.maps.observe(self._mask(mask))
+        else:
+            states = np.zeros((self.n_worlds * self.config.robots, ROBOT_STATE_SIZE), np.float32)
+            _batch.observe_worlds(
+                self._mask(mask), a.agents, a.scalars, a.edges, a.polygon_start, a.circles, a.dirs, a.inv_work,
+                a.owner_work, a.hits, a.params, a.flags, a.scans, states,
+            )  # fmt: skip
         return a.scans.copy().reshape(*per_robot, -1), states.reshape(*per_robot, ROBOT_STATE_SIZE)
 
     def humans(self) -> F32:
@@ -322,8 +378,10 @@ class Simulator:
         `original` physics this is what the lidar sees; collisions are decided by a grid.
         """
         a = self.arrays
-        n = int(a.scalars[world, lay.S_POLYGONS])
         where = np.atleast_2d(np.asarray(points, np.float64))
+        if self.maps is not None:
+            return self.maps.clearance(where, world)
+        n = int(a.scalars[world, lay.S_POLYGONS])
         edges, start = a.edges[world], a.polygon_start[world]
         return np.array([swept_clearance(x, y, x, y, edges, start, n) for x, y in where])
 
@@ -337,15 +395,19 @@ class Simulator:
             lay.A_X, lay.A_Y, lay.A_VX, lay.A_VY, lay.A_HEADING, lay.A_GX, lay.A_GY, lay.A_RADIUS, lay.A_VPREF,
             lay.A_SEES,
         ]  # fmt: skip
-        starts = a.polygon_start[world, : int(a.scalars[world, lay.S_POLYGONS]) + 1]
-        count = _step.fill_circles(-1, agents, robots, n, a.flags, a.circles)
-        bodies = a.circles[: count if self.config.rendering == "ellipse" else 0]
+        if self.maps is not None:
+            polygons, seen = self.maps.polygons(world), self.maps.bodies(world)
+        else:
+            starts = a.polygon_start[world, : int(a.scalars[world, lay.S_POLYGONS]) + 1]
+            polygons = [a.vertices[world, i:j].copy() for i, j in pairwise(starts)]
+            seen = a.circles[: _step.fill_circles(-1, agents, robots, n, a.flags, a.circles)].copy()
+        bodies = seen if self.config.rendering == "ellipse" else seen[:0]
         heading = np.arctan2(bodies[:, -1], bodies[:, -2])
         return WorldState(
             robot=agents[0, columns].copy(),
             humans=agents[robots : robots + n, human_columns].copy(),
-            polygons=[a.vertices[world, i:j].copy() for i, j in pairwise(starts)],
-            circles=a.circles[:count, :3].copy(),
+            polygons=polygons,
+            circles=seen[:, :3].copy(),
             step=int(a.scalars[world, lay.S_STEP]),
             robots=agents[:robots][:, columns].copy(),
             ellipses=np.column_stack([bodies[:, :2], bodies[:, -3], bodies[:, 2], heading]),
