@@ -39,7 +39,8 @@ included; singly = the same environment, one world, in turns. Reset = of a singl
 
 def known() -> list[str]:
     """Return the ids of all environments that can be made here."""
-    from navrep_data.registration import ENVIRONMENTS, gymnasium_id
+    from navrep_data.registration import ENVIRONMENTS
+    from navrep_data.sim import gymnasium_id
 
     return [gymnasium_id(env) for env in ENVIRONMENTS]
 

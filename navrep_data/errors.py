@@ -83,7 +83,7 @@ class SimulationError(NavrepDataError, RuntimeError):
 
 
 class DisplayError(NavrepDataError, RuntimeError):
-    """Something needs a window or a program that is not here."""
+    """Something needs a window, and none can be opened here."""
 
 
 class WorkerDiedError(NavrepDataError, RuntimeError):

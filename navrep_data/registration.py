@@ -13,24 +13,25 @@ from importlib.machinery import ModuleSpec
 from typing import Any
 
 VERSION = 0
-_NAMES = {
-    "navrep": "NavRep", "soadrl": "SOADRL", "cadrl": "CADRL", "ian": "IAN", "crowdmove": "CrowdMove",
-}  # fmt: skip
+# words that are spelt otherwise than by capitals alone
+_SPELLED = {"navrep": "NavRep", "soadrl": "SOADRL", "cadrl": "CADRL", "ian": "IAN", "crowdmove": "CrowdMove"}
 
-ENVIRONMENTS = ("navrep-test", "navrep-train", "navrep-val", "soadrl")
+ENVIRONMENTS = (
+    "cadrl",
+    *(f"crowdmove-{k}" for k in range(1, 7)),
+    "empty",
+    "ian",
+    "map",
+    *("mark-test-1", "mark-test-2", "mark-train-1", "mark-train-2"),
+    *("navrep-test", "navrep-train", "navrep-val"),
+    "soadrl",
+)
 """Names of the environments, as in :func:`navrep_data.sim.environment_names`; listed here because that loads numba."""
 
 
-def gymnasium_id(env: str) -> str:
-    """Return the gymnasium id of an environment's name: ``"navrep-test"`` -> ``"NavRepTest-v0"``.
-
-    Parameters
-    ----------
-    env : str
-        Name in the registry of environments.
-    """
-    words = (_NAMES.get(word, word.capitalize()) for word in env.split("-"))
-    return "".join(words) + f"-v{VERSION}"
+def camel_case(name: str) -> str:
+    """Return a kebab-case name in CamelCase, as gymnasium spells ids: ``mark-train-1`` -> ``MarkTrain1``."""
+    return "".join(_SPELLED.get(word, word.capitalize()) for word in name.split("-"))
 
 
 def register() -> None:
@@ -38,7 +39,7 @@ def register() -> None:
     from gymnasium.envs import registration
 
     for env in ENVIRONMENTS:
-        name = gymnasium_id(env)
+        name = f"{camel_case(env)}-v{VERSION}"
         if name not in registration.registry:
             registration.register(
                 id=name,

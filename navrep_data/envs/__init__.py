@@ -12,7 +12,8 @@ from navrep_data.envs.wrappers import (
     VectorRingsObservation,
     VectorScan1dObservation,
 )
-from navrep_data.registration import gymnasium_id, register
+from navrep_data.registration import register
+from navrep_data.sim import gymnasium_id
 
 __all__ = [
     "FlatObservation",

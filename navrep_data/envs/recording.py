@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from navrep_data.envs.single import NavRepEnv
-from navrep_data.errors import ConfigError, DisplayError
+from navrep_data.errors import ConfigError, MissingExtraError
 
 Policy = Callable[[Any], ArrayLike]
 """Takes an observation, returns an action in [-1, 1]."""
@@ -106,7 +106,7 @@ def record(
     ------
     ConfigError
         If `path` has another ending, or `env` is no NavRep environment.
-    DisplayError
+    MissingExtraError
         If MP4 is asked for and imageio-ffmpeg is not installed.
 
     Examples
@@ -173,7 +173,7 @@ def write_gif(path: Path, frames: list[NDArray[np.uint8]], seconds: float) -> No
 
 def _need_ffmpeg() -> Any:
     if importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise DisplayError(
+        raise MissingExtraError(
             "MP4 needs imageio-ffmpeg, which is not installed: pip install imageio-ffmpeg, or write a .gif."
         )
     return importlib.import_module("imageio_ffmpeg")
@@ -184,7 +184,7 @@ def write_mp4(path: Path, frames: list[NDArray[np.uint8]], seconds: float) -> No
 
     Raises
     ------
-    DisplayError
+    MissingExtraError
         If imageio-ffmpeg is not installed.
     """
     ffmpeg = _need_ffmpeg()

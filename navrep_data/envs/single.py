@@ -36,7 +36,8 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         ``"consistent"`` (default) or ``"original"``.
     episode : int, optional
         Number of the episode that the first bare reset plays, in environments with numbered episodes
-        (``navrep-test``: 500, ``navrep-val``: 50); later ones play the next, and the first again after the last.
+        (``navrep-test``: 500, ``navrep-val``: 50, ``ian``: any); later ones play the next, and the first again after the
+        last.
     render_mode : str, optional
         ``"rgb_array"``: :meth:`render` returns a picture; ``"human"``: a window that follows each step.
     pad_humans : bool
@@ -66,13 +67,15 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     the environment says otherwise). Goal and collisions terminate; timeout truncates.
 
     ``info`` holds, after reset and after each step: ``robot`` (3,) x, y, theta; ``humans`` (n, 4) x, y, vx, vy, world
-    frame; ``event``, the reason why the episode ended, or ``"none"``; and in environments with numbered episodes
-    ``seed``, the numpy seed of the episode. With several robots observations, actions and ``info["robot"]`` have a
+    frame; ``event``, the reason why the episode ended, or ``"none"``; in environments with numbered episodes ``seed``,
+    the numpy seed of the episode; with scenarios ``scenario``, the name. With several robots observations, actions and ``info["robot"]`` have a
     leading axis of robots, the reward is their mean and ``info["rewards"]`` each one's.
 
     ``reset(seed=s)`` plays numpy seed s in environments with numbered episodes, later bare resets s + 1, s + 2, ...;
-    ``reset(options={"episode": k})`` plays number k. In the other environments s names a random stream, which later
-    bare resets go on with.
+    ``reset(options={"episode": k})`` plays number k: numpy seed 1000 + k of ``navrep-test`` (500 of them), k of
+    ``navrep-val`` (50), and in ``ian`` scenario k modulo 27 with numpy seed k, as in the suite `navrep27`. Without a seed
+    ``ian`` starts anywhere, the others with number 0. In environments without numbers s names a random stream, which
+    later bare resets go on with.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}  # noqa: RUF012
@@ -181,6 +184,8 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         }
         if self._worlds.numbered:
             info["seed"] = int(self._worlds.seeds[0])
+        for name in self._worlds.scenarios():
+            info["scenario"] = name
         return info
 
     def frame(self, size: int = 480) -> NDArray[np.uint8]:
@@ -203,10 +208,10 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         if self._scan is None:
             raise gymnasium.error.ResetNeeded("There is nothing to draw before the first reset().")
-        state = self._worlds.sim.state()
+        state, grid = self._worlds.sim.state(), self._worlds.grid(0)
         if self._camera is None:
-            self._camera = Camera.around(state)
-        return draw_frame(state, self._camera, self._scan, self.config.sensor, self._trail, size)
+            self._camera = Camera.around(state, grid)
+        return draw_frame(state, self._camera, self._scan, self.config.sensor, self._trail, grid, size)
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture (480, 480, 3), uint8, in mode ``"rgb_array"``; draw the window in mode ``"human"``."""

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from navrep_data.errors import ConfigError
 from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, Event
-from navrep_data.sim import SimConfig, Simulator, make_config, numpy_seed
+from navrep_data.sim import SimConfig, Simulator, make_config, numpy_seed, scale_actions
 from navrep_data.sim import _layout as lay
+from navrep_data.sim.gridmap import GridMap
 from navrep_data.sim.simulator import MAX_NUMPY_SEED, MAX_SEED
 
 F32 = NDArray[np.float32]
@@ -50,24 +51,14 @@ def action_space(config: SimConfig) -> Any:
     return gymnasium.spaces.Box(-1.0, 1.0, (*lead(config), ACTION_SIZE), np.float32)
 
 
-def n_robots(config: SimConfig) -> int:
-    """Return the number of learning robots."""
-    return int(getattr(config, "robots", 1))
-
-
 def lead(config: SimConfig) -> tuple[int, ...]:
     """Return the axes that come before an observation's own: none for one robot, (robots,) for several."""
-    return () if n_robots(config) == 1 else (n_robots(config),)
-
-
-def max_velocity(config: SimConfig) -> F64:
-    """Return what a full action means: vx, vy [m/s], omega [rad/s]."""
-    return np.array(getattr(config, "max_velocity", (1.0, 1.0, 1.0)), np.float64)
+    return () if config.robots == 1 else (config.robots,)
 
 
 def state_bounds(config: SimConfig) -> tuple[F32, F32]:
     """Return low and high of the robot state, ndarrays of shape (5,), float32."""
-    vx, vy, omega = max_velocity(config)
+    vx, vy, omega = config.max_velocity
     # twice the command: limited acceleration overshoots
     speed = 2.0 * float(np.hypot(vx, vy))
     reach = _WORLD_SIZE + speed * config.time_limit
@@ -98,21 +89,25 @@ class Worlds:
     def __init__(self, config: SimConfig, n: int, episode: int | None = None) -> None:
         self.config = config
         self.n = n
-        self.numbered = _has_numbers(config.env)
+        self._scenarios = len(config.scenarios)
+        self.numbered = self._scenarios > 0 or _has_numbers(config.env)
         first = 0 if episode is None else self._number(episode)
         self.sim = Simulator(config, n)
-        self._scale = max_velocity(config)
         self._lead = lead(config)
         # what the next reset plays: a number of the environment's own list, or a numpy seed as it is
         self._next = first + np.arange(n)
         self._plain = np.zeros(n, np.bool_)
-        self._fresh = np.ones(n, np.bool_)  # streams that nobody has seeded yet
+        # what nobody has seeded yet; lists of numbered episodes start with their first
+        listed = self.numbered and (self._scenarios == 0 or episode is not None)
+        self._fresh = np.full(n, not listed)
         self._restarts = np.zeros(n, np.bool_)  # streams that start anew at the next reset, with these seeds
         self._streams = np.zeros(n, np.int64)
         self.seeds = np.zeros(n, np.int64)  # numpy seeds of the present episodes
         self.events = np.zeros(n, np.uint8)
 
     def _number(self, episode: Any) -> int:
+        if self._scenarios:
+            return _whole("episode", episode, MAX_NUMPY_SEED)
         numpy_seed(self.config.env, episode)  # checks both
         return int(episode)
 
@@ -128,7 +123,7 @@ class Worlds:
         options : mapping, optional
             ``{"episode": k}``: world i plays number k + i.
         random : numpy.random.Generator
-            Seeds streams that nobody has seeded.
+            Seeds what nobody has seeded.
         """
         known = {"episode", "reset_mask"}
         unknown = sorted(set(options or {}) - known)
@@ -136,54 +131,60 @@ class Worlds:
             raise ConfigError(f"Unknown reset option {unknown[0]!r}, expected one of: {', '.join(sorted(known))}.")
         if options and options.get("episode") is not None:
             self._next = self._number(options["episode"]) + np.arange(self.n)
-            self._plain[:] = False
+            self._plain[:] = self._fresh[:] = False
             return
         given = np.array([seed is not None for seed in seeds])
-        if self.numbered:
-            for i, seed in enumerate(seeds):
-                if seed is not None:
-                    self._next[i] = _whole("seed", seed, MAX_NUMPY_SEED)
-            self._plain |= given
-        else:
-            self._reseed(seeds, given, random)
-
-    def _reseed(self, seeds: Sequence[int | None], given: Mask, random: np.random.Generator) -> None:
         fresh = self._fresh & ~given
-        if not (given | fresh).any():
-            return
+        most = MAX_NUMPY_SEED if self.numbered else MAX_SEED
         keys = np.zeros(self.n, np.int64)
         for i, seed in enumerate(seeds):
             if seed is not None:
-                keys[i] = _whole("seed", seed, MAX_SEED)
-        keys[fresh] = random.integers(0, MAX_SEED, int(fresh.sum()))
-        self._streams[given | fresh] = keys[given | fresh]
-        self._restarts |= given | fresh
-        self._fresh[self._restarts] = False
+                keys[i] = _whole("seed", seed, most)
+        if fresh.any():
+            keys[fresh] = random.integers(0, most, int(fresh.sum()))
+        chosen = given | fresh
+        self._fresh[chosen] = False
+        if self.numbered:
+            self._next[chosen] = keys[chosen]
+            self._plain |= chosen
+        else:
+            self._streams[chosen] = keys[chosen]
+            self._restarts |= chosen
 
     def restart(self, mask: Mask) -> None:
         """Start the next episode in the worlds of `mask`."""
         self.events[mask] = 0
         if self.numbered:
-            for i in np.flatnonzero(mask):
-                k = int(self._next[i])
-                self.seeds[i] = k % (MAX_NUMPY_SEED + 1) if self._plain[i] else numpy_seed(self.config.env, k)
-            self._next[mask] += self.n
-            self.sim.reset_seeded(self.seeds, mask)
+            self._restart_numbered(mask)
             return
         anew = mask & self._restarts
         if anew.any():
-            self.sim.reset_streams(self._streams, anew)
+            self.sim.restart(self._streams, anew)
             self._restarts &= ~anew
             mask = mask & ~anew
         if mask.any():
             self.sim.reset(mask)
+
+    def _restart_numbered(self, mask: Mask) -> None:
+        for i in np.flatnonzero(mask):
+            k = int(self._next[i])
+            plain = self._plain[i] or self._scenarios
+            self.seeds[i] = k % (MAX_NUMPY_SEED + 1) if plain else numpy_seed(self.config.env, k)
+        # the suite navrep27: round r of scenario i has the numpy seed 27 r + i
+        scenes = mask & ~self._plain if self._scenarios else np.zeros_like(mask)
+        if scenes.any():
+            self.sim.reset_scenarios(self._next % self._scenarios, self.seeds, scenes)
+        others = mask & ~scenes
+        if others.any():
+            self.sim.reset_seeded(self.seeds, others)
+        self._next[mask] += self.n
 
     def step(self, actions: ArrayLike) -> F64:
         """Advance all under actions in [-1, 1], (n, 3) or (n, robots, 3); returns rewards, sets :attr:`events`."""
         commands = np.asarray(actions, np.float64)
         if commands.shape != (self.n, *self._lead, ACTION_SIZE):
             raise ConfigError(f"action has shape {commands.shape[1:]}, expected {(*self._lead, ACTION_SIZE)}.")
-        rewards, self.events = self.sim.step(np.clip(commands, -1.0, 1.0) * self._scale)
+        rewards, self.events = self.sim.step(scale_actions(self.config, commands))
         return rewards
 
     def observe(self, mask: Mask | None = None) -> Observation:
@@ -198,10 +199,20 @@ class Worlds:
 
     def humans(self) -> F64:
         """Return x, y [m], vx, vy [m/s] of the humans, (n, most humans, 4), world frame; NaN in empty slots."""
-        first = n_robots(self.config)
+        first = self.config.robots
         out = self.sim.arrays.agents[:, first:, _MOTION]
         out[np.arange(out.shape[1]) >= self.human_counts()[:, None]] = np.nan
         return out
+
+    def scenarios(self) -> list[str]:
+        """Return the names of the scenarios that are played, (n,); empty where there are none."""
+        maps = self.sim.maps
+        return [] if maps is None or not self._scenarios else [maps.scenario_name(w) for w in range(self.n)]
+
+    def grid(self, world: int) -> GridMap | None:
+        """Return the map that a world is on, None where there is none."""
+        maps = self.sim.maps
+        return None if maps is None else maps.data.maps[maps.map_index(world)]
 
     def human_counts(self) -> NDArray[np.int64]:
         """Return the number of humans in each world, (n,)."""

@@ -12,6 +12,7 @@ from PIL import Image, ImageColor, ImageDraw
 from navrep_data.errors import ConfigError
 from navrep_data.schema import SensorContract
 from navrep_data.sim.drawing import GOAL, HUMAN, OBSTACLE, RAY, ROBOT, scan_points
+from navrep_data.sim.gridmap import GridMap
 from navrep_data.sim.simulator import WorldState
 
 F64 = NDArray[np.float64]
@@ -26,7 +27,10 @@ _OVERSAMPLING = 2
 _MARGIN = 0.5
 # About so many rays are drawn as lines; all of them would hide the rest.
 _RAY_LINES = 36
+# Circles smaller than this are legs [m]
+_LEG_LIMIT = 0.1
 _LEAST_HALF = 3.0
+_MAP_MARGIN = 2.0
 _MIN_SIZE, _MAX_SIZE = 16, 4096
 _STAR = np.array([[np.sin(k * np.pi / 5), np.cos(k * np.pi / 5)] for k in range(10)]) * np.where(
     np.arange(10) % 2, 0.4, 1.0
@@ -50,11 +54,16 @@ class Camera:
     half: float
 
     @classmethod
-    def around(cls, state: WorldState) -> Camera:
-        """Return the camera that shows all of a world: obstacles, border, robot, humans and their goals."""
-        points = [state.robot[..., 0:2], state.robot[..., 3:5], state.humans[:, 0:2], state.humans[:, 5:7]]
-        everything = np.concatenate([np.reshape(p, (-1, 2)) for p in [*points, *state.polygons]])
+    def around(cls, state: WorldState, grid: GridMap | None = None) -> Camera:
+        """Return the camera that shows a world's obstacles, border, robots, humans and goals.
+
+        On a map: its part around them, with some metres to all sides.
+        """
+        points = [state.robots[:, 0:2], state.robots[:, 3:5], state.humans[:, 0:2], state.humans[:, 5:7]]
+        everything = np.concatenate([*points, *(state.polygons if grid is None else [])])
         low, high = everything.min(axis=0), everything.max(axis=0)
+        if grid is not None:
+            low, high = low - _MAP_MARGIN, high + _MAP_MARGIN
         x, y = (low + high) / 2
         return cls(float(x), float(y), max(_LEAST_HALF, float((high - low).max()) / 2 + _MARGIN))
 
@@ -136,6 +145,7 @@ def draw_frame(
     scan: ArrayLike,
     sensor: SensorContract,
     trail: Sequence[F64] = (),
+    grid: GridMap | None = None,
     size: int = 480,
 ) -> NDArray[np.uint8]:
     """Draw a world from above.
@@ -152,6 +162,8 @@ def draw_frame(
         The rays' angles.
     trail : sequence of ndarray of shape (robots, 2)
         Where the robots have been [m], one entry per step.
+    grid : GridMap, optional
+        The map, drawn instead of the state's polygons.
     size : int
         Width and height [pixels].
 
@@ -167,7 +179,7 @@ def draw_frame(
         If `size` is not from 16 to 4096.
     """
     canvas = Canvas(camera, size)
-    robots = np.reshape(state.robot, (-1, state.robot.shape[-1]))
+    robots = state.robots
     ends = [
         scan_points(ranges, robot[:3], sensor)
         for ranges, robot in zip(np.atleast_2d(np.asarray(scan)), robots, strict=True)
@@ -176,14 +188,15 @@ def draw_frame(
         canvas.polygon(points if sensor.covers_full_turn() else np.vstack([robot[:2], points]), fill=SEEN)
         for end in points[:: max(1, len(points) // _RAY_LINES)]:
             canvas.line([robot[:2], end], RAY_LINE, 0.5)
-    for corners in state.polygons:
+    if grid is not None:
+        canvas.cells(grid.occupied, grid.origin, grid.resolution, OBSTACLE)
+    for corners in state.polygons if grid is None else ():
         solid = _area(corners) > 0.0
         canvas.polygon(corners, fill=OBSTACLE if solid else None, line=OBSTACLE, width=1.5)
     for x, y, vx, vy, radius in state.humans[:, [0, 1, 2, 3, 7]]:
         canvas.disc(x, y, radius, BODY, HUMAN)
         canvas.line([(x, y), (x + vx, y + vy)], HUMAN, 1.0)
-    for x, y, radius in state.circles:
-        canvas.disc(x, y, radius, LEG)
+    _draw_bodies(canvas, state)
     for points in ends:
         canvas.dots(points, RAY)
     if len(trail):
@@ -192,6 +205,20 @@ def draw_frame(
     for robot in robots:
         _draw_robot(canvas, robot, max(0.35, 0.02 * camera.half))
     return canvas.array()
+
+
+def _draw_bodies(canvas: Canvas, state: WorldState) -> None:
+    """Draw what the lidar sees of people: legs, or outlines of trunks and ellipses."""
+    turn = np.linspace(0.0, 2 * np.pi, 24)
+    for x, y, along, across, heading in state.ellipses:
+        c, s = np.cos(heading), np.sin(heading)
+        u, v = along * np.cos(turn), across * np.sin(turn)
+        canvas.polygon(np.column_stack([x + c * u - s * v, y + s * u + c * v]), line=LEG)
+    for x, y, radius in state.circles if len(state.ellipses) == 0 else ():
+        if radius < _LEG_LIMIT:
+            canvas.disc(x, y, radius, LEG)
+        else:
+            canvas.polygon(np.column_stack([x + radius * np.cos(turn), y + radius * np.sin(turn)]), line=LEG)
 
 
 def _draw_robot(canvas: Canvas, robot: F64, star: float) -> None:

@@ -2,24 +2,36 @@
 
 import gymnasium
 import numpy as np
+import pytest
 
-from navrep_data.registration import ENVIRONMENTS, gymnasium_id
-from navrep_data.sim import numpy_seed
+from navrep_data.errors import MissingExtraError
+from navrep_data.registration import ENVIRONMENTS
+from navrep_data.sim import gymnasium_id, make_config
+from navrep_data.sim.maps import map_names
 
 PHYSICS = ("consistent", "original")
-CASES = [(env, physics) for env in ENVIRONMENTS for physics in PHYSICS]
+NUMBERED = ["navrep-test", "navrep-val"]
+"""Environments whose episodes are numpy seeds from a list."""
+try:
+    HAS_MAPS = bool(map_names())
+except MissingExtraError:
+    HAS_MAPS = False
 
 
 def is_numbered(env):
-    try:
-        numpy_seed(env, 0)
-    except ValueError:
-        return False
-    return True
+    return env == "ian" or env in NUMBERED
 
 
-NUMBERED = [env for env in ENVIRONMENTS if is_numbered(env)]
-STREAMED = [env for env in ENVIRONMENTS if not is_numbered(env)]
+def param(env, *more):
+    needs_maps = make_config(env).world == "map"
+    skip = pytest.mark.skipif(needs_maps and not HAS_MAPS, reason="needs the maps: pip install 'navrep-data[maps]'")
+    return pytest.param(env, *more, marks=skip)
+
+
+ALL = [param(env) for env in ENVIRONMENTS]
+# in the released software people walk on maps in scenarios only
+CASES = [param(env, physics) for env in ENVIRONMENTS for physics in PHYSICS if (env, physics) != ("map", "original")]
+STREAMED = [param(env) for env in ENVIRONMENTS if not is_numbered(env)]
 
 
 def make(env, **kwargs):

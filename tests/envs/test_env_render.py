@@ -13,7 +13,7 @@ from env_cases import make, same
 from matplotlib.figure import Figure
 
 from navrep_data.envs import NavRepEnv, goal_policy, record, window
-from navrep_data.errors import ConfigError, DisplayError
+from navrep_data.errors import ConfigError, DisplayError, MissingExtraError
 from navrep_data.sim import Simulator, drawing, make_config, raster
 
 
@@ -164,7 +164,7 @@ def test_objects_with_act_and_cut_films(tmp_path):
 def test_mp4_without_the_program_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(DisplayError, match="pip install imageio-ffmpeg"):
+    with pytest.raises(MissingExtraError, match="pip install imageio-ffmpeg"):
         record(make("navrep-test"), goal_policy, tmp_path / "e.mp4")
     assert not list(tmp_path.iterdir())
 
