@@ -2,7 +2,7 @@
 
 python examples/gallery.py --out docs/images/gallery.png [--physics original] [--only NavRepTrain IAN ...]
 
-The maps are those of the package asl-pepper-2d-sim, which states no licence; without it their environments are left out.
+The maps are those of the package asl-pepper-2d-sim, which states no licence; without it, no environments on maps.
 """
 
 import argparse

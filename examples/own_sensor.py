@@ -2,8 +2,8 @@
 
 python examples/own_sensor.py --rays 240 --degrees 270 --noise 0.02 --dropout 0.01 --out sensor.png
 
-A scanner with few rays, a limited field of view, noise and lost rays drives through a world; ScanAdapter brings its scans
-to the 1080 rays of the models and datasets of this package.
+A scanner with few rays, a limited field of view, noise and lost rays drives through a world; ScanAdapter brings its
+scans to the 1080 rays of the models and datasets of this package.
 """
 
 import argparse

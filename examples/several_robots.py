@@ -1,4 +1,4 @@
-"""Several robots in one world, each driven by the same policy: the worlds of the CrowdMove environments, or of your own.
+"""Several robots in one world, each driven by the same policy: in the CrowdMove environments, or any other.
 
 python examples/several_robots.py --robots 6 --humans 5 --out robots.gif
 

@@ -24,14 +24,17 @@ def is_numbered(env):
 
 def param(env, *more):
     needs_maps = make_config(env).world == "map"
-    skip = pytest.mark.skipif(needs_maps and not HAS_MAPS, reason="needs the maps: pip install 'navrep-data[maps]'")
-    return pytest.param(env, *more, marks=skip)
+    marks = [pytest.mark.skipif(needs_maps and not HAS_MAPS, reason="needs the maps: pip install 'navrep-data[maps]'")]
+    # one of each kind is enough for the quick tests
+    if env.startswith(("mark-t", "crowdmove-")) and env not in ("mark-test-2", "crowdmove-1"):
+        marks.append(pytest.mark.slow)
+    return pytest.param(env, *more, marks=marks)
 
 
 ALL = [param(env) for env in ENVIRONMENTS]
 # in the released software people walk on maps in scenarios only
 CASES = [param(env, physics) for env in ENVIRONMENTS for physics in PHYSICS if (env, physics) != ("map", "original")]
-STREAMED = [param(env) for env in ENVIRONMENTS if not is_numbered(env)]
+STREAMED = [case for case in CASES if not is_numbered(case.values[0])]
 
 
 def make(env, **kwargs):

@@ -5,7 +5,7 @@ import json
 import gymnasium
 import numpy as np
 import pytest
-from env_cases import CASES, NUMBERED, PHYSICS, STREAMED, make, same
+from env_cases import CASES, HAS_MAPS, NUMBERED, PHYSICS, STREAMED, make, same
 from gymnasium.utils.env_checker import check_env
 
 from navrep_data.envs import NavRepEnv, goal_policy
@@ -73,8 +73,7 @@ def test_original_episodes_are_the_original_softwares(shared):
         np.testing.assert_allclose(info["robot"], run["robot"], atol=1e-6)
 
 
-@pytest.mark.parametrize("env", STREAMED)
-@pytest.mark.parametrize("physics", PHYSICS)
+@pytest.mark.parametrize(("env", "physics"), STREAMED)
 def test_a_seed_is_a_stream_elsewhere(env, physics):
     sim = Simulator(make_config(env, physics=physics), seed=41)
     world = make(env, physics=physics)
@@ -97,7 +96,8 @@ def test_info_says_where_everybody_is(env, physics):
     _, info = world.reset(seed=7)
     for step in range(12):
         state = world._worlds.sim.state()
-        np.testing.assert_array_equal(info["robot"], state.robot[..., :3])
+        robots = state.robots[:, :3]
+        np.testing.assert_array_equal(info["robot"], robots if len(robots) > 1 else robots[0])
         np.testing.assert_array_equal(info["humans"], state.humans[:, :4])
         assert info["event"] == "none", step
         observation, _, terminated, truncated, info = world.step(np.zeros(world.action_space.shape))
@@ -219,3 +219,39 @@ def test_wrong_calls_say_so_in_one_line():
 def test_str_names_environment_and_physics():
     assert str(NavRepEnv("soadrl")) == "<NavRepEnv soadrl, consistent>"
     assert len(ENVIRONMENTS) == len(set(ENVIRONMENTS))
+
+
+@pytest.mark.skipif(not HAS_MAPS, reason="needs the maps: pip install 'navrep-data[maps]'")
+def test_ian_plays_the_suites_episodes_by_number_and_numpy_seeds_by_seed():
+    sim = Simulator(make_config("ian", physics="original"))
+    names = sim.config.scenarios
+    assert len(names) == 27
+    env = make("ian", physics="original", episode=30)
+    for k in (30, 31):
+        observation, info = env.reset()
+        assert (info["seed"], info["scenario"]) == (k, names[k % 27])
+        sim.reset_scenarios([k % 27], [k])
+        np.testing.assert_array_equal(observation["robot_state"], sim.observe()[1][0])
+    sim.reset_seeded([77])
+    observation, info = env.reset(seed=77)
+    assert info["seed"] == 77
+    np.testing.assert_array_equal(observation["robot_state"], sim.observe()[1][0])
+    assert env.reset()[1]["seed"] == 78
+    one = make("ian", scenarios=("rlasl1",))
+    assert {one.reset()[1]["scenario"] for _ in range(3)} == {"rlasl1"}
+    seeds = {make("ian").reset()[1]["seed"] for _ in range(3)}
+    assert len(seeds) == 3
+    observation, *_ = one.step([1.0, 1.0, 0.0])
+    np.testing.assert_allclose(np.linalg.norm(observation["robot_state"][2:4]), 0.55, atol=1e-6)
+
+
+@pytest.mark.skipif(not HAS_MAPS, reason="needs the maps: pip install 'navrep-data[maps]'")
+def test_several_robots_have_an_axis():
+    env = make("crowdmove-1")
+    observation, info = env.reset(seed=4)
+    assert observation["scan"].shape == (10, 1080)
+    assert observation["robot_state"].shape == (10, 5)
+    assert (info["robot"].shape, info["humans"].shape) == ((10, 3), (0, 4))
+    _, reward, _, _, info = env.step(env.action_space.sample())
+    assert info["rewards"].shape == (10,)
+    assert reward == pytest.approx(info["rewards"].mean())
