@@ -17,8 +17,11 @@ from navrep_data.errors import MissingExtraError
 from navrep_data.sim import environment_names
 
 # as in the README's table
-ORDER = ("navrep-train", "navrep-val", "navrep-test", "soadrl", "cadrl", "empty", "ian", "map")
-STEPS, TILE, TITLE, COLUMNS = 25, 260, 22, 6
+ORDER = (
+    *("navrep-train", "navrep-val", "navrep-test", "soadrl", "cadrl", "empty", "ian", "map"),
+    *("mark-train-1", "mark-train-2", "mark-test-1", "mark-test-2"),
+)
+STEPS, TILE, GAP, TITLE, COLUMNS = 25, 250, 10, 22, 6
 
 
 def sorted_names() -> list[str]:
@@ -64,14 +67,15 @@ def main() -> None:
             print(f"{title_of(name)} is left out: {error}")
     columns = min(COLUMNS, len(tiles))
     rows = math.ceil(len(tiles) / columns)
-    sheet = Image.new("RGB", (columns * TILE, rows * (TILE + TITLE)), "white")
+    sheet = Image.new("RGB", (columns * (TILE + GAP), rows * (TILE + TITLE)), "white")
     draw = ImageDraw.Draw(sheet)
     for k, (title, tile) in enumerate(tiles):
-        x, y = (k % columns) * TILE, (k // columns) * (TILE + TITLE)
+        x, y = (k % columns) * (TILE + GAP) + GAP // 2, (k // columns) * (TILE + TITLE)
         draw.text((x + TILE / 2, y + TITLE / 2), title, "black", ImageFont.load_default(15), anchor="mm")
         sheet.paste(Image.fromarray(tile), (x, y + TITLE))
-    # few colours: a third of the size
-    sheet.quantize(96, dither=Image.Dither.NONE).save(arguments.out, optimize=True)
+    # a palette halves the size; median cut would drop the few red and green pixels
+    palette = sheet.quantize(128, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    palette.save(arguments.out, optimize=True)
     print(f"{arguments.out}: {len(tiles)} environments")
 
 
