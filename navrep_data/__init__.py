@@ -1,6 +1,7 @@
 """navrep-data: datasets and pretrained models for robots that navigate among people.
 
-Sub-packages are imported on first use, so that ``import navrep_data`` stays light (no torch, no numba).
+Sub-packages are imported on first use, so that ``import navrep_data`` stays light (no torch, no numba). The gymnasium
+ids are registered as strings, without loading gymnasium: ``gymnasium.make("navrep_data:NavRepTest-v0")`` works alone.
 """
 
 from __future__ import annotations
@@ -9,10 +10,12 @@ import importlib
 from types import ModuleType
 
 from navrep_data._version import __version__
+from navrep_data.registration import register_soon
 
 __all__ = [
     "__version__",
     "datasets",
+    "envs",
     "errors",
     "generate",
     "io",
@@ -24,6 +27,8 @@ __all__ = [
     "testing",
     "zoo",
 ]
+
+register_soon()
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -82,6 +82,10 @@ class SimulationError(NavrepDataError, RuntimeError):
     """The simulator reached a state that it cannot go on from."""
 
 
+class DisplayError(NavrepDataError, RuntimeError):
+    """Something needs a window, and none can be opened here."""
+
+
 class WorkerDiedError(NavrepDataError, RuntimeError):
     """A worker process ended without a result."""
 

@@ -39,3 +39,45 @@ def test_picture(root, tmp_path):
     image = Image.open(tmp_path / "p.png")
     assert image.size == (1210, 660)
     assert len(image.convert("RGB").getcolors(1 << 20)) > 50
+
+
+@pytest.mark.slow
+def test_gallery(tmp_path):
+    out = run("gallery.py", "--out", tmp_path / "g.png", "--only", "NavRepTrain", "CADRL", "SOADRL")
+    assert "3 environments" in out
+    image = Image.open(tmp_path / "g.png").convert("RGB")
+    assert image.size == (3 * 260, 272)
+    assert len(image.getcolors(1 << 20)) > 30
+
+
+@pytest.mark.slow
+def test_own_policy(tmp_path):
+    out = run("own_policy.py", "--episodes", 20, "--film", tmp_path / "e.gif")
+    assert out.startswith("20 episodes: ")
+    assert "goal" in out
+    with Image.open(tmp_path / "e.gif") as film:
+        assert film.n_frames > 5
+
+
+@pytest.mark.slow
+def test_own_sensor(tmp_path):
+    out = run("own_sensor.py", "--out", tmp_path / "s.png")
+    assert "(240,) -> (1080,)" in out
+    with Image.open(tmp_path / "s.png") as image:
+        assert image.size == (900, 450)
+
+
+@pytest.mark.slow
+def test_own_map(tmp_path):
+    out = run("own_map.py", "--draw", tmp_path / "office", "--episodes", 2, "--film", tmp_path / "e.gif")
+    assert "240 x 240 cells of 0.05 m" in out
+    with Image.open(tmp_path / "e.gif") as film:
+        assert film.n_frames > 5
+
+
+@pytest.mark.slow
+def test_several_robots(tmp_path):
+    out = run("several_robots.py", "--robots", 4, "--episodes", 2, "--out", tmp_path / "r.gif")
+    assert out.count("after") == 2
+    with Image.open(tmp_path / "r.gif") as film:
+        assert film.n_frames > 3

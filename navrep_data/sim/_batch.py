@@ -71,11 +71,13 @@ def step_worlds(
 
 @kernel
 def observe_worlds(
-    agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, scans, states
+    mask, agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, scans, states
 ):  # fmt: skip
-    """Fill scans (W R, rays) [m] and robot states (W R, 5) of all worlds, robot by robot."""
+    """Fill scans (W R, rays) [m] and robot states (W R, 5), robot by robot, of the worlds of `mask` (W,)."""
     robots = flags[F_ROBOTS]
     for w in range(agents.shape[0]):
+        if not mask[w]:
+            continue
         for r in range(robots):
             k = w * robots + r
             observe_scan(

@@ -47,10 +47,14 @@ def step_map_worlds(actions, worlds, maps, rules, bodies, path, orca, moves, rew
 
 
 @kernel
-def observe_map_worlds(worlds, maps, rules, bodies, dirs, inv_work, owner_work, hits, params, flags, scans, states):
-    """Fill scans (W R, rays) [m] and robot states (W R, 5) of all worlds, robot by robot."""
+def observe_map_worlds(
+    mask, worlds, maps, rules, bodies, dirs, inv_work, owner_work, hits, params, flags, scans, states
+):
+    """Fill scans (W R, rays) [m] and robot states (W R, 5), robot by robot, of the worlds of `mask` (W,)."""
     robots = int(rules[R_ROBOTS])
     for w in range(worlds.agents.shape[0]):
+        if not mask[w]:
+            continue
         for r in range(robots):
             k = w * robots + r
             scan_map_world(

@@ -166,13 +166,13 @@ class MapWorlds:
             commands, a.worlds, self.data.tables, a.rules, a.circles, a.path, a.orca, a.moves, rewards, events
         )
 
-    def observe(self) -> F32:
-        """Fill the arrays' scans and return robot states (W R, 5)."""
+    def observe(self, mask: NDArray[np.bool_]) -> F32:
+        """Fill the arrays' scans in the worlds of `mask` (W,) and return robot states (W R, 5), 0 in the others."""
         a = self.arrays
         states = np.zeros((len(a.scans), ROBOT_STATE_SIZE), np.float32)
         _ian_batch.observe_map_worlds(
-            a.worlds, self.data.tables, a.rules, a.circles, a.dirs, a.inv_work, a.owner_work, a.hits, a.params, a.flags,
-            a.scans, states,
+            mask, a.worlds, self.data.tables, a.rules, a.circles, a.dirs, a.inv_work, a.owner_work, a.hits, a.params,
+            a.flags, a.scans, states,
         )  # fmt: skip
         return states
 

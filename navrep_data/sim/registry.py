@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from navrep_data.errors import ConfigError, UnknownNameError, did_you_mean
+from navrep_data.registration import VERSION, camel_case
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.map_environments import MAP_ENVIRONMENTS, original_fields
 
@@ -38,10 +39,6 @@ _ENVIRONMENTS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 _ENVIRONMENTS |= MAP_ENVIRONMENTS
-
-# gymnasium's ids are CamelCase with a version; these words are spelled otherwise than by capitals alone
-_SPELLED = {"navrep": "NavRep", "soadrl": "SOADRL", "cadrl": "CADRL", "ian": "IAN", "crowdmove": "CrowdMove"}
-_GYMNASIUM_VERSION = 0
 
 # crowd_sim.py: numpy is seeded with an offset plus the case counter, which wraps at the phase's size
 _NUMBERED: dict[str, tuple[int, int]] = {"navrep-val": (0, 50), "navrep-test": (1000, 500)}
@@ -92,12 +89,7 @@ def gymnasium_id(name: str) -> str:
         If there is no such environment.
     """
     _lookup(name)
-    return f"{camel_case(name)}-v{_GYMNASIUM_VERSION}"
-
-
-def camel_case(name: str) -> str:
-    """Return a kebab-case name in CamelCase, as gymnasium spells ids: ``mark-train-1`` -> ``MarkTrain1``."""
-    return "".join(_SPELLED.get(word, word.capitalize()) for word in name.split("-"))
+    return f"{camel_case(name)}-v{VERSION}"
 
 
 def _lookup(name: str) -> tuple[str, dict[str, Any]]:

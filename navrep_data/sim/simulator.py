@@ -329,21 +329,22 @@ class Simulator:
         """The axis of robots, where there is one."""
         return (self.config.robots,) if self.config.robots > 1 else ()
 
-    def observe(self) -> tuple[F32, F32]:
+    def observe(self, mask: ArrayLike | None = None) -> tuple[F32, F32]:
         """Return scans (W, n_rays) [m] and robot states (W, 5), both float32, of the present state.
 
         Robot state: goal x, goal y [m], vx, vy [m/s], omega [rad/s] in the robot frame. With R > 1 robots:
-        (W, R, n_rays) and (W, R, 5).
+        (W, R, n_rays) and (W, R, 5). With a `mask` (W,) only its worlds are observed: in the others the scan is the one
+        before and the robot state 0.
         """
         a = self.arrays
         per_robot = (self.n_worlds, *self._per_robot)
         if self.maps is not None:
-            states = self.maps.observe()
+            states = self.maps.observe(self._mask(mask))
         else:
             states = np.zeros((self.n_worlds * self.config.robots, ROBOT_STATE_SIZE), np.float32)
             _batch.observe_worlds(
-                a.agents, a.scalars, a.edges, a.polygon_start, a.circles, a.dirs, a.inv_work, a.owner_work, a.hits,
-                a.params, a.flags, a.scans, states,
+                self._mask(mask), a.agents, a.scalars, a.edges, a.polygon_start, a.circles, a.dirs, a.inv_work,
+                a.owner_work, a.hits, a.params, a.flags, a.scans, states,
             )  # fmt: skip
         return a.scans.copy().reshape(*per_robot, -1), states.reshape(*per_robot, ROBOT_STATE_SIZE)
 

@@ -1,0 +1,158 @@
+"""The vectorised environment: single stepping bit for bit, automatic resets, gymnasium's infos."""
+
+import gymnasium
+import numpy as np
+import pytest
+from env_cases import CASES, is_numbered, make, make_vec, same
+from gymnasium.vector import AutoresetMode
+
+from navrep_data.envs import NavRepEnv, NavRepVectorEnv, goal_policy
+from navrep_data.errors import ConfigError
+
+STEPS = 60
+
+
+def actions_of(rng, env):
+    """Return fast actions that mostly go one way, so that episodes end."""
+    shape = env.action_space.shape
+    return np.clip(
+        rng.uniform(-1.0, 1.0, shape) + np.linspace(-1.0, 1.0, shape[0]).reshape(-1, *[1] * (len(shape) - 1)), -1, 1
+    )
+
+
+@pytest.mark.parametrize(("env", "physics"), CASES)
+@pytest.mark.parametrize("n", [1, 4])
+def test_equals_single_stepping_bit_for_bit(env, physics, n):
+    """World i: seed + i; later episodes of numbered environments step by n."""
+    vector = make_vec(env, n, physics=physics, time_limit=6.0)
+    singles = [make(env, physics=physics, time_limit=6.0, pad_humans=True) for _ in range(n)]
+    plays = [90 + i for i in range(n)]
+    observations, infos = vector.reset(seed=90)
+    rng, ended = np.random.default_rng(0), 0
+    first = [single.reset(seed=seed) for single, seed in zip(singles, plays, strict=True)]
+    for i, (observation, info) in enumerate(first):
+        assert same(observation, {k: v[i] for k, v in observations.items()})
+        assert all(np.array_equal(infos[k][i], info[k], equal_nan=k == "humans") for k in info)
+    for _ in range(STEPS):
+        actions = actions_of(rng, vector)
+        observations, rewards, terminations, truncations, infos = vector.step(actions)
+        for i, single in enumerate(singles):
+            observation, reward, terminated, truncated, info = single.step(actions[i])
+            assert (rewards[i], terminations[i], truncations[i]) == (reward, terminated, truncated)
+            if terminated or truncated:
+                ended += 1
+                assert infos["_final_obs"][i]
+                assert infos["_final_info"][i]
+                assert same(infos["final_obs"][i], observation)
+                assert all(np.array_equal(infos["final_info"][k][i], info[k], equal_nan=k == "humans") for k in info)
+                plays[i] += n
+                observation, info = single.reset(**({"seed": plays[i]} if is_numbered(env) else {}))
+            elif "final_obs" in infos:
+                assert infos["final_obs"][i] is None
+                assert not infos["_final_info"][i]
+            assert same(observation, {k: v[i] for k, v in observations.items()})
+            assert all(np.array_equal(infos[k][i], info[k], equal_nan=k == "humans") for k in info)
+    # the released software knows no time limit with several robots
+    assert ended >= n or (env.startswith("crowdmove") and physics == "original")
+
+
+@pytest.mark.parametrize("env", ["navrep-train", "soadrl"])
+def test_infos_are_those_of_gymnasiums_own_vector_environment(env):
+    """Keys, masks, dtypes and fillers, recursively."""
+    ours = make_vec(env, 3, time_limit=4.0)
+    theirs = gymnasium.make_vec(
+        "NavRepTrain-v0" if env == "navrep-train" else "SOADRL-v0",
+        num_envs=3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+        pad_humans=True, time_limit=4.0,
+    )  # fmt: skip
+    assert ours.single_observation_space == theirs.single_observation_space
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert ours.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    a, b = ours.reset(seed=5), theirs.reset(seed=5)
+    assert same(a[0], b[0])
+    assert same(a[1], b[1])
+    rng, finals = np.random.default_rng(1), 0
+    for _ in range(50):
+        actions = rng.uniform(-1.0, 1.0, (3, 3)).astype(np.float32)
+        a, b = ours.step(actions), theirs.step(actions)
+        finals += "final_obs" in a[4]
+        for x, y in zip(a, b, strict=True):
+            assert same(x, y)
+    assert finals > 0
+
+
+def test_numbered_episodes_are_shared_out_and_wrap():
+    env = make_vec("navrep-test", 3, episode=499, time_limit=0.4, humans=0, obstacles=0)
+    _, infos = env.reset()
+    assert infos["seed"].tolist() == [1499, 1000, 1001]
+    seen = [infos["seed"]]
+    for _ in range(8):
+        infos = env.step(np.zeros((3, 3)))[4]
+        if "final_info" in infos:
+            assert infos["final_info"]["event"].tolist() == ["timeout"] * 3
+            assert infos["final_info"]["seed"].tolist() == seen[-1].tolist()
+            seen.append(infos["seed"])
+    assert [s.tolist() for s in seen[1:3]] == [[1002, 1003, 1004], [1005, 1006, 1007]]
+    assert env.reset(options={"episode": 498})[1]["seed"].tolist() == [1498, 1499, 1000]
+
+
+@pytest.mark.parametrize(("env", "physics"), CASES)
+def test_same_seed_same_episodes_whatever_the_batch(env, physics):
+    few, many = make_vec(env, 2, physics=physics), make_vec(env, 5, physics=physics)
+    for seed in (3, 800):
+        a, b = few.reset(seed=seed)[0], many.reset(seed=seed)[0]
+        assert same(a, {k: v[:2] for k, v in b.items()})
+        assert not np.array_equal(a["robot_state"][0], a["robot_state"][1])
+
+
+def test_some_worlds_can_be_reset_alone():
+    env = NavRepVectorEnv(3, "navrep-train")
+    before, _ = env.reset(seed=[4, None, 9])
+    assert same(env.reset(seed=[4, None, 9])[0]["scan"][2], before["scan"][2])
+    for _ in range(5):
+        moved, *_ = env.step(np.full((3, 3), 0.5))
+    mask = np.array([False, True, False])
+    after, _ = env.reset(seed=[None, 4, None], options={"reset_mask": mask})
+    assert same(after["scan"][1], before["scan"][0])
+    assert same(after["scan"][[0, 2]], moved["scan"][[0, 2]])
+
+
+def test_returned_arrays_are_the_callers():
+    env = NavRepVectorEnv(2, "navrep-test")
+    observations, infos = env.reset(seed=1)
+    kept = observations["scan"].copy()
+    for _ in range(3):
+        env.step(goal_policy(observations))
+    assert same(observations["scan"], kept)
+    infos["robot"][:] = np.nan
+    assert np.isfinite(env.step(np.zeros((2, 3)))[4]["robot"]).all()
+
+
+def test_pictures_of_all_worlds():
+    env = make_vec("navrep-test", 2, render_mode="rgb_array")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.render()
+    env.reset(seed=0)
+    env.step(np.zeros((2, 3)))
+    frames = env.render()
+    single = NavRepEnv("navrep-test", render_mode="rgb_array")
+    single.reset(seed=1)
+    single.step(np.zeros(3))
+    assert same(frames[1], single.render())
+    assert make_vec("navrep-test", 2).render() is None
+
+
+def test_wrong_calls_say_so_in_one_line():
+    env = NavRepVectorEnv(2, "navrep-test")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros((2, 3)))
+    with pytest.raises(ConfigError, match="3 seeds were given, expected one number or 2 of them"):
+        env.reset(seed=[1, 2, 3])
+    with pytest.raises(ConfigError, match="reset_mask has shape"):
+        env.reset(options={"reset_mask": np.zeros(2, bool)})
+    with pytest.raises(ConfigError, match="render_mode is 'human', expected one of: rgb_array"):
+        NavRepVectorEnv(2, "navrep-test", render_mode="human")
+    with pytest.raises(ConfigError, match="n_worlds is 0"):
+        NavRepVectorEnv(0)
+    assert "navrep-test" in str(env) or "num_envs=2" in str(env)
