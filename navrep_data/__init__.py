@@ -14,6 +14,7 @@ __all__ = [
     "__version__",
     "datasets",
     "errors",
+    "evaluate",
     "generate",
     "io",
     "models",
