@@ -12,7 +12,7 @@ from navrep_data._kernels import kernel
 from navrep_data.sim._geometry import point_segment_sq
 
 # settings (SETTINGS,) float64
-D_MAX_SPEED = 0  # [m/s]
+D_MAX_SPEED = 0  # limit of the velocity's norm [m/s]
 D_ACCELERATION = 1  # of the window, and for stopping [m/s^2]
 D_DT = 2  # the window's time step [s]
 D_HORIZON = 3  # of the forward simulation [s]
@@ -24,8 +24,7 @@ D_WEIGHT_SPEED = 8
 D_ANGLE_MIN = 9  # of the rays [rad]
 D_ANGLE_INCREMENT = 10
 D_RANGE_MAX = 11  # rays of this length hit nothing [m]
-D_BOX = 12  # 1: each axis is limited to the speed, 0: their norm is
-SETTINGS = 13
+SETTINGS = 12
 
 SAMPLES = 13
 """Velocities per axis of the window."""
@@ -83,11 +82,12 @@ def choose(scan, vx, vy, tx, ty, radius, settings, points, out):
     """Fill out (2,) with the best velocity of the window [m/s], robot frame.
 
     Sampled are a grid over the window, standing still and the way straight to the target. A velocity is admissible if
-    the robot can stop before contact. Of the admissible ones the one with the greatest weighted sum of progress to the
-    target within the horizon, clearance and speed wins; if none is, the robot stands.
+    there is no contact in this time step, and the robot can stop before there is one. Of the admissible ones that with
+    the greatest weighted sum of progress to the target within the horizon, clearance and speed wins; if there is none,
+    the robot stands.
     """
     top, dt, horizon = settings[D_MAX_SPEED], settings[D_DT], settings[D_HORIZON]
-    reach = top * np.sqrt(2.0) * horizon + radius + settings[D_MARGIN] + settings[D_CLEARANCE]
+    reach = top * horizon + radius + settings[D_MARGIN] + settings[D_CLEARANCE]
     n_points = near_points(scan, reach, settings, points)
     change = settings[D_ACCELERATION] * dt
     distance = np.hypot(tx, ty)
@@ -105,10 +105,10 @@ def choose(scan, vx, vy, tx, ty, radius, settings, points, out):
         if abs(ux - vx) > change + 1e-9 or abs(uy - vy) > change + 1e-9:
             continue
         speed = np.hypot(ux, uy)
-        if (max(abs(ux), abs(uy)) if settings[D_BOX] > 0.5 else speed) > top + 1e-9:
+        if speed > top + 1e-9:
             continue
         gap, contact = clearance_along(ux, uy, horizon, radius + settings[D_MARGIN], points, n_points)
-        if speed > 0.0 and speed > settings[D_ACCELERATION] * contact:
+        if speed > 0.0 and (contact < dt or speed > settings[D_ACCELERATION] * contact):
             continue
         # beyond the target nothing is won: progress is that of the nearest point of the segment
         nearest = np.sqrt(point_segment_sq(tx, ty, 0.0, 0.0, ux * horizon, uy * horizon))

@@ -100,10 +100,10 @@ class DwaPilot(Pilot):
     def __init__(
         self,
         acceleration: float = 2.5,
-        horizon: float = 1.6,
+        horizon: float = 2.0,
         margin: float = 0.1,
         clearance: float = 0.6,
-        weights: tuple[float, float, float] = (1.0, 0.4, 0.1),
+        weights: tuple[float, float, float] = (1.0, 1.2, 0.1),
         ahead: float = 2.0,
     ) -> None:
         self.ahead = ahead

@@ -23,7 +23,8 @@ Row = dict[str, Any]
 
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#7F7F7F")
 SUCCESS, COLLISION, TIMEOUT = "#0072B2", "#D55E00", "#E69F00"
-OUTCOMES = {"S": (SUCCESS, "goal"), "C": (COLLISION, "collision"), "T": (TIMEOUT, "timeout")}
+OUTCOMES = {"S": (SUCCESS, "goal", ""), "C": (COLLISION, "collision", "x"), "T": (TIMEOUT, "timeout", "s")}
+"""Colour, label and the marker at the end of a trajectory, so that outcomes differ without colour too."""
 PAPER_SCENARIOS = ("rlasl_office_j1", "irosasl_office_j2", "irosunity_scene_map3", "irosasl2")
 """Columns of the paper's figure: simplest and global planning on the realistic map, everything on the complex one,
 global planning on the simple one."""
@@ -139,8 +140,8 @@ def _paths(ax: Any, results: Results, episodes: Sequence[int], linewidth: float 
             if k < len(results.outcome) and results.outcome[k] == letter and k in results.trajectories:
                 xy = results.trajectories[k]
                 ax.plot(*xy.T, color=OUTCOMES[letter][0], linewidth=linewidth, alpha=alpha, zorder=4)
-                if letter != "S":
-                    ax.plot(*xy[-1], "x", color=OUTCOMES[letter][0], markersize=3.5, markeredgewidth=0.9, zorder=5)
+                end = {"color": OUTCOMES[letter][0], "marker": OUTCOMES[letter][2], "fillstyle": "none"}
+                ax.plot(*xy[-1], markersize=3.5, markeredgewidth=0.9, zorder=5, **end)
 
 
 def _overlaid(ax: Any, results: Results, episodes: Sequence[int], size: float = 9) -> None:
@@ -160,7 +161,10 @@ def _overlaid(ax: Any, results: Results, episodes: Sequence[int], size: float = 
 def _legend(figure: Any) -> None:
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], color=colour, label=label) for colour, label in OUTCOMES.values()]
+    handles = [
+        Line2D([], [], color=colour, label=label, marker=marker, fillstyle="none", markersize=5)
+        for colour, label, marker in OUTCOMES.values()
+    ]
     figure.legend(handles=handles, loc="outside upper right", ncols=3, fontsize=8, frameon=False)
 
 
@@ -168,7 +172,7 @@ def overlay(found: Sequence[Results], rows: Sequence[Row]) -> Any:
     """Return one panel per policy with all trajectories of a suite whose worlds differ from episode to episode."""
     columns = min(4, len(found))
     lines = math.ceil(len(found) / columns)
-    figure = _figure(2.6 * columns + 0.6, 3.4 * lines + 0.6)
+    figure = _figure(2.6 * columns + 0.6, 2.75 * lines + 0.6)
     axes = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
     for ax, results in zip(axes.flat, found, strict=False):
         episodes = range(len(results.outcome))

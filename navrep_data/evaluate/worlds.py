@@ -134,7 +134,7 @@ class PolygonWorlds:
 
     def shortest(self) -> F64:
         """See :class:`Worlds` and the notes of this class."""
-        to_goal = np.linalg.norm(self.goals() - self.poses()[:, :2], axis=1)
+        to_goal: F64 = np.linalg.norm(self.goals() - self.poses()[:, :2], axis=1)
         return np.maximum(to_goal - self.radii(), 0.0)
 
     def orca(self) -> F64:
