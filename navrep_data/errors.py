@@ -26,6 +26,14 @@ class UnknownNameError(NavrepDataError, LookupError):
     """A name that is in no registry."""
 
 
+class MapError(NavrepDataError, ValueError):
+    """A map file cannot be used, or a place on a map cannot be used for what was asked."""
+
+
+class MissingExtraError(NavrepDataError, ImportError):
+    """An optional package is not installed; the message gives the pip command."""
+
+
 class DatasetError(NavrepDataError, ValueError):
     """A folder or file is not what a dataset looks like."""
 

@@ -1,0 +1,249 @@
+"""Reading map folders of the ROS map_server: a YAML file and an image, both taken for hostile until checked."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from PIL import Image
+
+from navrep_data.errors import MapError, MissingExtraError
+
+EXTRA_PACKAGE = "asl_pepper_2d_sim_maps"
+PIP_COMMAND = 'pip install "navrep-data[maps]"'
+YAML_SUFFIXES = (".yaml", ".yml")
+# Map descriptions have about 150 bytes.
+MAX_YAML_BYTES = 1 << 16
+# 8192 x 8192; the largest of the paper's maps has 8.3 million pixels. Bounds memory before anything is decoded.
+MAX_PIXELS = 1 << 26
+MAX_IMAGE_BYTES = 1 << 28
+# Formats that the decoder may try: what map_server's users write. Others of pillow's decoders stay shut.
+_FORMATS = ("PPM", "PNG")
+_GREY_MODES = ("L", "1", "P", "RGB")
+_REQUIRED = ("image", "resolution", "origin", "occupied_thresh", "free_thresh")
+_MODES = ("trinary", "scale")
+
+
+@dataclass(frozen=True)
+class MapDescription:
+    """What a map's YAML file says, checked.
+
+    Attributes
+    ----------
+    yaml_path, image_path : pathlib.Path
+        Both resolved; the image lies in the folder of the YAML file or below.
+    resolution : float
+        Side of a cell [m].
+    origin : tuple of float
+        Lower-left corner of the lower-left cell [m].
+    occupied_threshold, free_threshold : float
+        Occupancies above and below which a cell is solid and free.
+    negate : bool
+        Whether dark means free.
+    """
+
+    yaml_path: Path
+    image_path: Path
+    resolution: float
+    origin: tuple[float, float]
+    occupied_threshold: float
+    free_threshold: float
+    negate: bool
+
+
+def packaged_folder() -> Path:
+    """Return the folder of the paper's maps in the optional package, without importing its modules.
+
+    Raises
+    ------
+    MissingExtraError
+        If the package is not installed.
+    """
+    try:
+        spec = importlib.util.find_spec(EXTRA_PACKAGE)
+    except (ImportError, ValueError):
+        spec = None
+    for place in (spec.submodule_search_locations or []) if spec is not None else []:
+        folder = Path(place) / "maps"
+        if folder.is_dir():
+            return folder
+    raise MissingExtraError(
+        f"The paper's maps are not installed: they come with the package asl-pepper-2d-sim. Run {PIP_COMMAND}, "
+        "or give the path of a map of your own (a YAML file or its folder)."
+    )
+
+
+def yaml_in_folder(folder: Path) -> Path:
+    """Return the only YAML file of `folder`.
+
+    Raises
+    ------
+    MapError
+        If there is none, or several.
+    """
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in YAML_SUFFIXES)
+    if len(found) == 1:
+        return found[0]
+    seen = "none" if not found else ", ".join(path.name for path in found[:5])
+    raise MapError(f"Map folder {folder} must hold one YAML file, found {seen}: give the path of the YAML file itself.")
+
+
+def read_description(path: Path, *, packaged: bool = False) -> MapDescription:
+    """Read and check a map's YAML file.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The file.
+    packaged : bool
+        Whether it is one of the paper's: there an absolute image path stands for the file of that name beside it.
+
+    Raises
+    ------
+    MapError
+        If the file is missing, too large, not YAML, or has a key that is missing or cannot be used.
+    """
+    if not path.is_file():
+        raise MapError(f"Map file {path} does not exist: expected a map_server YAML file.")
+    if path.stat().st_size > MAX_YAML_BYTES:
+        raise MapError(f"{path} has {path.stat().st_size:,} bytes, expected at most {MAX_YAML_BYTES:,}: no map file.")
+    try:
+        content = yaml.safe_load(path.read_bytes())
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
+        said = " ".join(str(error).split())[:120]
+        raise MapError(f"{path} is not valid YAML ({said}): expected a map_server map file.") from error
+    if not isinstance(content, dict):
+        raise MapError(f"{path} holds {type(content).__name__}, expected keys {', '.join(_REQUIRED)}: no map file.")
+    missing = [key for key in _REQUIRED if key not in content]
+    if missing:
+        raise MapError(f"{path} lacks {', '.join(missing)}, expected {', '.join(_REQUIRED)}: add them.")
+    resolution = _number(path, "resolution", content["resolution"])
+    if not resolution > 0.0:
+        raise MapError(f"{path}: resolution is {resolution:g}, expected a positive number of metres: correct it.")
+    occupied = _number(path, "occupied_thresh", content["occupied_thresh"])
+    free = _number(path, "free_thresh", content["free_thresh"])
+    if not 0.0 <= free < occupied <= 1.0:
+        raise MapError(
+            f"{path}: free_thresh is {free:g} and occupied_thresh {occupied:g}, expected 0 <= free_thresh < "
+            "occupied_thresh <= 1: correct them."
+        )
+    negate = content.get("negate", 0)
+    if negate not in (0, 1):
+        raise MapError(f"{path}: negate is {str(negate)[:40]!r}, expected 0 or 1: correct it.")
+    if content.get("mode", "trinary") not in _MODES:
+        raise MapError(
+            f"{path}: mode is {str(content['mode'])[:40]!r}, expected {' or '.join(_MODES)}: export the map in one."
+        )
+    return MapDescription(
+        yaml_path=path.resolve(),
+        image_path=_image_path(path, content["image"], packaged),
+        resolution=resolution,
+        origin=_origin(path, content["origin"]),
+        occupied_threshold=occupied,
+        free_threshold=free,
+        negate=bool(negate),
+    )
+
+
+def _number(path: Path, key: str, value: Any) -> float:
+    try:
+        # YAML 1.1 takes 5e-2 for text; map_server does not
+        number = float(value) if isinstance(value, int | float | str) and not isinstance(value, bool) else math.nan
+    except (ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise MapError(f"{path}: {key} is {str(value)[:40]!r}, expected a number: correct it.")
+    return number
+
+
+def _origin(path: Path, value: Any) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) not in (2, 3):
+        raise MapError(f"{path}: origin is {str(value)[:60]!r}, expected [x, y, 0]: correct it.")
+    numbers = [_number(path, "origin", item) for item in value]
+    if len(numbers) == 3 and numbers[2] != 0.0:
+        raise MapError(
+            f"{path}: origin turns the map by {numbers[2]:g} rad, expected 0: rotate the image and set it to 0."
+        )
+    return numbers[0], numbers[1]
+
+
+def _image_path(path: Path, image: Any, packaged: bool) -> Path:
+    if not isinstance(image, str) or not image or "\0" in image:
+        raise MapError(f"{path}: image is {str(image)[:60]!r}, expected a file name: correct it.")
+    pure = PurePosixPath(image)
+    if packaged and pure.is_absolute():
+        # cla_glass_hall.yaml names a path of its author's machine
+        image, pure = pure.name, PurePosixPath(pure.name)
+    windows = PureWindowsPath(image)
+    if pure.is_absolute() or windows.is_absolute() or windows.drive or ".." in windows.parts:
+        raise MapError(
+            f"{path}: image {image[:60]!r} is absolute or leaves the folder, expected a file beside the YAML file: "
+            "copy the image there and name it."
+        )
+    found = path.resolve().parent / pure
+    if not found.is_file():
+        raise MapError(
+            f"{path}: image {image[:60]!r} does not exist in {path.parent}: put it there or correct the name."
+        )
+    found = found.resolve()
+    if not found.is_relative_to(path.resolve().parent):
+        raise MapError(f"{path}: image {image[:60]!r} is a link that leaves the folder: copy the image there instead.")
+    return found
+
+
+def read_grey(path: Path) -> NDArray[np.uint8]:
+    """Return a map image as (rows, columns) uint8, row 0 at the top, its size checked before it is decoded.
+
+    Raises
+    ------
+    MapError
+        If it is no PGM or PNG image of 8-bit grey, or too large.
+    """
+    if path.stat().st_size > MAX_IMAGE_BYTES:
+        raise MapError(f"{path} has {path.stat().st_size:,} bytes, expected at most {MAX_IMAGE_BYTES:,}: crop the map.")
+    try:
+        with warnings.catch_warnings():
+            # ours is the stricter bound
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=_FORMATS) as image:
+                width, height = image.size
+                if width * height > MAX_PIXELS:
+                    raise MapError(
+                        f"{path} is {width} x {height} pixels, expected at most {MAX_PIXELS:,}: crop it or halve "
+                        "its resolution."
+                    )
+                if image.mode not in _GREY_MODES:
+                    raise MapError(f"{path} has pixels of mode {image.mode}, expected 8-bit grey: convert it to that.")
+                return np.array(image.convert("L"), dtype=np.uint8)
+    except (OSError, ValueError, SyntaxError, EOFError, MemoryError, Image.DecompressionBombError) as error:
+        if isinstance(error, MapError):
+            raise
+        said = " ".join(str(error).split())[:120]
+        raise MapError(f"{path} cannot be read as an image ({said}): expected a PGM or PNG of 8-bit grey.") from error
+
+
+def occupancy_of(grey: NDArray[np.uint8], rule: str, negate: bool) -> NDArray[np.float32]:
+    """Return occupancies indexed [column, row from the bottom], (W, H) float32.
+
+    Parameters
+    ----------
+    grey : ndarray of shape (H, W), uint8
+        Row 0 at the top.
+    rule : {"original", "ros"}
+        ``1 - v / 254`` of the original's loader, or ``(255 - v) / 255`` of map_server.
+    negate : bool
+        Whether white is solid; only with "ros".
+    """
+    values = np.arange(256, dtype=np.float64)
+    if rule == "original":
+        table = 1.0 - values / 254.0
+    else:
+        table = values / 255.0 if negate else (255.0 - values) / 255.0
+    return np.ascontiguousarray(table.astype(np.float32)[grey.T[:, ::-1]])
