@@ -7,7 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from navrep_data.errors import MissingExtraError
+from navrep_data.sim.maps import load_map
+from navrep_data.sim.scenarios import get_scenario
+
 F64 = NDArray[np.float64]
+
+LOITER = 0.5
+"""Humans whose start is nearer to their goal than this stay there [m]."""
 
 
 @dataclass(frozen=True)
@@ -37,5 +44,14 @@ class Backdrop:
 
 
 def backdrop(scenario: str) -> Backdrop:
-    """Return what to draw behind the trajectories of a scenario."""
-    raise NotImplementedError
+    """Return what to draw behind the trajectories of a scenario; without the maps extra, all but the map."""
+    recipe = get_scenario(scenario)
+    try:
+        grid = load_map(recipe.map)
+    except MissingExtraError:
+        occupied, extent = None, (0.0, 1.0, 0.0, 1.0)
+    else:
+        occupied, extent = grid.occupied, grid.extent
+    humans = recipe.starts[1:, :2]
+    far = np.linalg.norm(recipe.goals[1:] - humans, axis=1) >= LOITER
+    return Backdrop(occupied, extent, recipe.starts[0, :2], recipe.goals[0], humans, far)

@@ -59,6 +59,7 @@ class OrcaPilot(Pilot):
 
     name = "orca"
     sees = "true humans"
+    sees_on_maps = "true humans, map"
     text = "ORCA among all humans and obstacles"
 
     def act(self, worlds: Worlds) -> F64:
@@ -83,8 +84,6 @@ class DwaPilot(Pilot):
         More is not better [m].
     weights : tuple of float
         Of progress, clearance and speed.
-    ahead : float
-        Distance of the point on the planned path [m].
 
     Notes
     -----
@@ -94,6 +93,7 @@ class DwaPilot(Pilot):
 
     name = "dwa"
     sees = "scan"
+    sees_on_maps = "scan, map"
     text = "dynamic window on the scan"
     needs_scan = True
 
@@ -104,9 +104,7 @@ class DwaPilot(Pilot):
         margin: float = 0.1,
         clearance: float = 0.6,
         weights: tuple[float, float, float] = (1.0, 1.2, 0.1),
-        ahead: float = 2.0,
     ) -> None:
-        self.ahead = ahead
         self._settings = np.zeros(_dwa.SETTINGS)
         self._settings[_dwa.D_ACCELERATION] = acceleration
         self._settings[_dwa.D_HORIZON] = horizon
@@ -121,7 +119,7 @@ class DwaPilot(Pilot):
         s[_dwa.D_DT], s[_dwa.D_RANGE_MAX] = sensor.dt, sensor.range_max
         s[_dwa.D_ANGLE_MIN], s[_dwa.D_ANGLE_INCREMENT] = sensor.angle_min, sensor.angle_increment
         poses = worlds.poses()
-        targets = _to_robot_frame(worlds.targets(self.ahead) - poses[:, :2], poses[:, 2])
+        targets = _to_robot_frame(worlds.targets() - poses[:, :2], poses[:, 2])
         chosen = np.zeros((worlds.n, 2))
         points = np.zeros((sensor.n_rays, 2))
         _dwa.choose_all(worlds.scans(), worlds.robot_states(), targets, worlds.radii(), s, points, chosen)

@@ -122,7 +122,9 @@ def benchmark(
     kind = chosen.physics if physics is None else physics
     _check(kind, workers, batch, policies)
     total = chosen.total(episodes)
-    specs = list({s.name: s for s in (resolve_policy(p, source, inference) for p in policies)}.values())
+    specs = list(
+        {s.name: s for s in (resolve_policy(p, source, inference, bool(chosen.maps)) for p in policies)}.values()
+    )
     specs = [s if s.kind == "zoo" else _plain(s) for s in specs]
     everybody = specs if any(s.name == "goal" for s in specs) else [resolve_policy("goal"), *specs]
     folder = Path(out) / f"{chosen.name}-{kind}"

@@ -16,8 +16,8 @@ import numpy as np
 from navrep_data.evaluate.backdrops import Backdrop, backdrop
 from navrep_data.evaluate.results import Results
 from navrep_data.evaluate.statistics import wilson
-from navrep_data.evaluate.suites import MAP_KINDS
 from navrep_data.io import atomic_write_bytes
+from navrep_data.sim.scenarios import MAP_GROUPS
 
 Row = dict[str, Any]
 
@@ -116,7 +116,7 @@ def bars(rows: Sequence[Row], groups: Sequence[Row], baseline: Row) -> Any:
         labels = [bar["label"] for bar in _series(rows, groups, part)]
         ax.set_xticks(range(n), labels, rotation=45, ha="right", rotation_mode="anchor", fontsize=8)
         ax.set_xlim(-0.6, n - 0.4)
-        ax.set_title("all" if part is None else f"{MAP_KINDS[part]} ({part})", fontsize=9)
+        ax.set_title("all" if part is None else f"{MAP_GROUPS[part]} ({part})", fontsize=9)
         ax.grid(axis="y", linewidth=0.4, alpha=0.5, zorder=0)
         for side in ("top", "right"):
             ax.spines[side].set_visible(False)
@@ -272,7 +272,7 @@ def comparison(found: Sequence[Results]) -> Any:
             episodes = _episodes(results, i)
             _paths(ax, results, episodes)
             _overlaid(ax, results, episodes)
-        axes[0, column].set_title(f"{name}\n({MAP_KINDS[suite.scenarios[i].map]} map)", fontsize=7.5)
+        axes[0, column].set_title(f"{name}\n({MAP_GROUPS[suite.scenarios[i].map]} map)", fontsize=7.5)
     for ax, results in zip(axes[:, 0], found, strict=True):
         ax.set_ylabel(results.name, fontsize=7)
     figure.supxlabel(_NOTE, fontsize=6.5)

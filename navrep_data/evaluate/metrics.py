@@ -39,7 +39,11 @@ METRICS: tuple[Metric, ...] = (
     Metric("time_to_goal", "s", "steps x time step, of the episodes that reached the goal", successes_only=True),
     Metric("path_length", "m", "sum of the distances between the robot's positions one step apart"),
     Metric("spl", "", "success weighted by path length: success x shortest / max(shortest, path length)"),
-    Metric("min_clearance", "m", "smallest gap between the robot's edge and a human's disc or an obstacle"),
+    Metric(
+        "min_clearance",
+        "m",
+        "smallest gap between the robot's edge and a human's disc or an obstacle (of those within a metre, on maps)",
+    ),
     Metric("personal_space_time", "s", "time with the nearest human's disc less than 0.2 m from the robot's edge"),
     Metric("mean_jerk", "m/s^3", "mean norm of the second difference of the velocity over the time step squared"),
 )

@@ -6,6 +6,7 @@ import hashlib
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -30,6 +31,8 @@ class Pilot(ABC):
         Full name, as in results.
     sees : str
         What it is told beside the goal and its own velocity: scan, map, true humans.
+    sees_on_maps : str
+        The same in worlds on maps, empty where it does not differ.
     text : str
         One line on what it is.
     needs_scan : bool
@@ -43,6 +46,7 @@ class Pilot(ABC):
 
     name: str
     sees: str
+    sees_on_maps: str = ""
     text: ClassVar[str] = ""
     needs_scan: bool = False
     max_worlds: int | None = None
@@ -125,6 +129,9 @@ class ZooPilot(FunctionPilot):
 
     def start(self, worlds: Worlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
         """Clear the memory of new episodes, and start the noise of a group."""
+        if worlds.sensor.range_max > self._policy.sensor.range_max:
+            # in the original's test nobody cuts ranges at the 25 m of the training, so the networks get them as they are
+            self._policy.sensor = replace(self._policy.sensor, range_max=worlds.sensor.range_max)
         if self.grouped:
             first = int(episodes[mask][0]) // BLOCK * BLOCK
             self._policy.reset(batch_size=BLOCK, seed=self._first_seed + first)

@@ -69,6 +69,7 @@ def resolve_policy(
     policy: str | Callable[[Any, Any], Any],
     source: str | os.PathLike[str] | None = None,
     inference: str = "deterministic",
+    on_maps: bool = False,
 ) -> PilotSpec:
     """Return what a name stands for.
 
@@ -80,6 +81,8 @@ def resolve_policy(
         Folder or address with the zoo's files.
     inference : str
         For the zoo's memories.
+    on_maps : bool
+        Whether it will drive in worlds on maps, where baselines are told the planned way.
 
     Raises
     ------
@@ -97,7 +100,8 @@ def resolve_policy(
         name = f"{kind.__module__}:{kind.__qualname__}"
         return PilotSpec(name, "scan", name, "function", files=_hashes(policy), function=policy)
     if policy in BASELINES:
-        return PilotSpec(policy, BASELINES[policy].sees, policy, "baseline")
+        pilot = BASELINES[policy]
+        return PilotSpec(policy, (on_maps and pilot.sees_on_maps) or pilot.sees, policy, "baseline")
     if ":" in policy:
         return PilotSpec(policy, "scan", policy, "function", files=_hashes(load_callable(policy)))
     return _from_zoo(policy, None if source is None else os.fspath(source), inference)

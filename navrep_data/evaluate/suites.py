@@ -5,15 +5,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from navrep_data.errors import ConfigError, UnknownNameError, did_you_mean
+from navrep_data.evaluate.map_worlds import ScenarioWorlds
 from navrep_data.evaluate.worlds import PolygonWorlds, Worlds
 from navrep_data.io import json_bytes
 from navrep_data.sim import SimConfig, make_config
-
-MAP_KINDS = {"asl": "simple", "unity_scene_map": "complex", "asl_office_j": "realistic"}
-"""What the paper calls the maps of its test."""
+from navrep_data.sim.maps import load_map
+from navrep_data.sim.scenarios import MAP_GROUPS, get_scenario, scenario_names
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Suite:
     @property
     def maps(self) -> tuple[str, ...]:
         """The maps of its scenarios, in the paper's order; empty for procedural worlds."""
-        return tuple(m for m in MAP_KINDS if any(s.map == m for s in self.scenarios))
+        return tuple(m for m in MAP_GROUPS if any(s.map == m for s in self.scenarios))
 
     def seed(self, episode: int) -> int:
         """Return the numpy seed of an episode."""
@@ -133,7 +134,38 @@ NAVREPTEST = Suite(
     data_hash=str,
 )
 
-_SUITES = {NAVREPTEST.name: NAVREPTEST}
+
+def _ian_config(physics: str) -> SimConfig:
+    return make_config("ian", physics=physics)
+
+
+@cache
+def _scenario_hash() -> str:
+    """Return the hash of all scenarios and of the maps that they lie on."""
+    digest = hashlib.sha256()
+    for name in scenario_names():
+        scenario = get_scenario(name)
+        digest.update(f"{name} {scenario.map} {load_map(scenario.map).hash}".encode())
+        for array in (scenario.starts, scenario.goals, scenario.permissivity):
+            digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+NAVREP27 = Suite(
+    name="navrep27",
+    text="the paper's 27 scenarios on three maps, episode r of scenario i = numpy seed 27 r + i",
+    physics="original",
+    scenarios=tuple(Scenario(name, get_scenario(name).map) for name in scenario_names()),
+    rounds=300,
+    max_rounds=100_000,
+    first_seed=0,
+    max_steps=1001,
+    config=_ian_config,
+    make=ScenarioWorlds,
+    data_hash=_scenario_hash,
+)
+
+_SUITES = {suite.name: suite for suite in (NAVREPTEST, NAVREP27)}
 
 
 def suite_names() -> list[str]:

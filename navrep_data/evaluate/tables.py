@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from navrep_data.evaluate.metrics import METRICS
-from navrep_data.evaluate.suites import MAP_KINDS
+from navrep_data.sim.scenarios import MAP_GROUPS
 
 Row = dict[str, Any]
 
@@ -83,7 +83,7 @@ def per_part(rows: Sequence[Row], baseline: Row | None, parts: str) -> str:
         for r in rows:
             part = r[parts][name]
             of = baseline[parts][name] if baseline else None
-            label = f"{name} ({MAP_KINDS[name]})" if name in MAP_KINDS else name
+            label = f"{name} ({MAP_GROUPS[name]})" if name in MAP_GROUPS else name
             lines.append(
                 [label, *_start(r, baseline, part, of), _share(part, "collision"), _share(part, "timeout")]
             )  # fmt: skip

@@ -58,8 +58,8 @@ class Worlds(Protocol):
     def orca(self) -> F64:
         """Return the velocities (W, 2) that ORCA chooses for robots that see all humans [m/s]."""
 
-    def targets(self, ahead: float) -> F64:
-        """Return points (W, 2) to head for: `ahead` [m] along the planned path, or the goals where there is no map."""
+    def targets(self) -> F64:
+        """Return points (W, 2) to head for: ahead on the planned way, or the goals where there is no map."""
 
     def speed(self) -> float:
         """Return the velocity that an action of 1 stands for [m/s]."""
@@ -107,7 +107,7 @@ class PolygonWorlds:
         c, s = np.cos(robot[:, lay.A_HEADING]), np.sin(robot[:, lay.A_HEADING])
         gx, gy = (robot[:, lay.A_GX] - robot[:, lay.A_X]), (robot[:, lay.A_GY] - robot[:, lay.A_Y])
         vx, vy = robot[:, lay.A_VX], robot[:, lay.A_VY]
-        columns = [c * gx + s * gy, c * gy - s * gx, c * vx + s * vy, c * vy - s * vx, a.scalars[:, lay.S_OMEGA]]
+        columns = [c * gx + s * gy, c * gy - s * gx, c * vx + s * vy, c * vy - s * vx, robot[:, lay.A_OMEGA]]
         return np.stack(columns, axis=1).astype(np.float32)
 
     def _robots(self, columns: int | list[int]) -> F64:
@@ -145,7 +145,7 @@ class PolygonWorlds:
         )
         return self._velocities
 
-    def targets(self, ahead: float) -> F64:
+    def targets(self) -> F64:
         """Return the goals: there is no map."""
         return self.goals()
 
