@@ -26,9 +26,9 @@ D_ANGLE_INCREMENT = 10
 D_RANGE_MAX = 11  # rays of this length hit nothing [m]
 SETTINGS = 12
 
-SAMPLES = 13
+SAMPLES = 11
 """Velocities per axis of the window."""
-GROUP = 4
+GROUP = 6
 """Neighbouring rays of which the shortest counts."""
 
 
@@ -58,7 +58,7 @@ def clearance_along(vx, vy, horizon, radius, points, n_points):
     Points that overlap the robot now do not count where it moves away from them: they would block every way out.
     """
     ex, ey = vx * horizon, vy * horizon
-    gap = np.inf
+    nearest_sq = np.inf
     contact = np.inf
     speed_sq = vx * vx + vy * vy
     for k in range(n_points):
@@ -68,13 +68,13 @@ def clearance_along(vx, vy, horizon, radius, points, n_points):
         if now_sq < radius * radius and along <= 0.0:
             continue
         d_sq = point_segment_sq(px, py, 0.0, 0.0, ex, ey)
-        gap = min(gap, np.sqrt(d_sq) - radius)
+        nearest_sq = min(nearest_sq, d_sq)
         if d_sq < radius * radius and speed_sq > 0.0:
             # |p - v t| = radius
             root = along * along - speed_sq * (now_sq - radius * radius)
             if root >= 0.0:
                 contact = min(contact, max(0.0, (along - np.sqrt(root)) / speed_sq))
-    return gap, contact
+    return np.sqrt(nearest_sq) - radius, contact
 
 
 @kernel
@@ -94,27 +94,30 @@ def choose(scan, vx, vy, tx, ty, radius, settings, points, out):
     straight = min(top, distance / dt) / max(distance, 1e-9)
     best = -np.inf
     out[0], out[1] = 0.0, 0.0
-    for sample in range(SAMPLES * SAMPLES + 2):
-        if sample < SAMPLES * SAMPLES:
+    # the way straight to the target first: what follows has to beat it, most need no look at the points
+    for sample in range(-2, SAMPLES * SAMPLES):
+        if sample >= 0:
             ux = vx + change * (2.0 * (sample // SAMPLES) / (SAMPLES - 1) - 1.0)
             uy = vy + change * (2.0 * (sample % SAMPLES) / (SAMPLES - 1) - 1.0)
-        elif sample == SAMPLES * SAMPLES:
-            ux, uy = 0.0, 0.0
-        else:
+        elif sample == -2:
             ux, uy = tx * straight, ty * straight
+        else:
+            ux, uy = 0.0, 0.0
         if abs(ux - vx) > change + 1e-9 or abs(uy - vy) > change + 1e-9:
             continue
         speed = np.hypot(ux, uy)
         if speed > top + 1e-9:
             continue
-        gap, contact = clearance_along(ux, uy, horizon, radius + settings[D_MARGIN], points, n_points)
-        if speed > 0.0 and (contact < dt or speed > settings[D_ACCELERATION] * contact):
-            continue
         # beyond the target nothing is won: progress is that of the nearest point of the segment
         nearest = np.sqrt(point_segment_sq(tx, ty, 0.0, 0.0, ux * horizon, uy * horizon))
         score = settings[D_WEIGHT_PROGRESS] * (distance - nearest) / (top * horizon)
-        score += settings[D_WEIGHT_CLEARANCE] * min(max(gap, 0.0), settings[D_CLEARANCE]) / settings[D_CLEARANCE]
         score += settings[D_WEIGHT_SPEED] * speed / top
+        if score + settings[D_WEIGHT_CLEARANCE] <= best:
+            continue  # not even with all the clearance that counts
+        gap, contact = clearance_along(ux, uy, horizon, radius + settings[D_MARGIN], points, n_points)
+        if speed > 0.0 and (contact < dt or speed > settings[D_ACCELERATION] * contact):
+            continue
+        score += settings[D_WEIGHT_CLEARANCE] * min(max(gap, 0.0), settings[D_CLEARANCE]) / settings[D_CLEARANCE]
         if score > best:
             best = score
             out[0], out[1] = ux, uy

@@ -130,7 +130,7 @@ class ZooPilot(FunctionPilot):
     def start(self, worlds: Worlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
         """Clear the memory of new episodes, and start the noise of a group."""
         if worlds.sensor.range_max > self._policy.sensor.range_max:
-            # in the original's test nobody cuts ranges at the 25 m of the training, so the networks get them as they are
+            # the original's test does not cut ranges at the 25 m of its training: networks get them as they are
             self._policy.sensor = replace(self._policy.sensor, range_max=worlds.sensor.range_max)
         if self.grouped:
             first = int(episodes[mask][0]) // BLOCK * BLOCK
