@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from navrep_data.errors import MapError
 from navrep_data.sim import _ian_layout as il
-from navrep_data.sim._map_edges import link_edges
 from navrep_data.sim._obstacles import OF_FIELDS, OI_FIELDS
+from navrep_data.sim._map_edges import link_edges
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.gridmap import GridMap
 from navrep_data.sim.maps import goal_field, load_map, planning_map, planning_speeds

@@ -59,7 +59,7 @@ def test_worlds_show_what_the_simulator_shows(physics):
 
 
 def slow_shortest(scenario):
-    """Dijkstra over the free cells and their eight neighbours: never shorter than the true way, by 8 % at most longer."""
+    """Dijkstra over free cells and their eight neighbours: never shorter than the true way, at most 8 % longer."""
     recipe = get_scenario(scenario)
     grid = load_map(recipe.map)
     room = grid.signed_distance() >= np.float32(0.3)
