@@ -25,6 +25,7 @@ from navrep_data.schema import COLUMNS, UINT16_RANGE_LIMIT
 from navrep_data.shards import LOCK_FILE, MANIFEST_FILE, MAX_SHARD_BYTES, Manifest, estimate_bytes
 from navrep_data.sim import RolloutSettings, SimConfig
 from navrep_data.sim.config import complete as complete_config
+from navrep_data.sim.rollout import check_rings
 
 DEFAULT_SHARD_ROWS = 20_000
 MAX_SEQUENCES = 2**31 - 1
@@ -83,6 +84,7 @@ def check_settings(
             f"--scan-dtype uint16 holds ranges up to {UINT16_RANGE_LIMIT:g} m, but range_max is "
             f"{config.sensor.range_max:g} m; use float32."
         )
+    check_rings(config, rings)
     chosen = scan_dtype or ("float32" if far else "uint16")
     return RolloutSettings(
         check_count("length", length, 1, MAX_LENGTH), chosen, rings, humans and config.max_others > 0

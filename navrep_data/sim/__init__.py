@@ -1,5 +1,6 @@
 """NavRepSim: worlds, humans, lidar and robot, for many independent worlds at once."""
 
+from navrep_data.sim.actions import scale_actions
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
 from navrep_data.sim.registry import describe_environment, environment_names, gymnasium_id, make_config, numpy_seed
@@ -29,5 +30,6 @@ __all__ = [
     "gymnasium_id",
     "make_config",
     "numpy_seed",
+    "scale_actions",
     "warm_up",
 ]

@@ -49,8 +49,8 @@ def update_contacts(agents, walkers, contacts, n_robots, n, rng):
     """
     for i in range(n):
         for j in range(i + 1, n):
-            gap = np.hypot(agents[j, A_X] - agents[i, A_X], agents[j, A_Y] - agents[i, A_Y])
-            if gap < CONTACT_REACH * agents[i, A_RADIUS] + CONTACT_REACH * agents[j, A_RADIUS]:
+            dx, dy = agents[j, A_X] - agents[i, A_X], agents[j, A_Y] - agents[i, A_Y]
+            if np.sqrt(dx * dx + dy * dy) < CONTACT_REACH * agents[i, A_RADIUS] + CONTACT_REACH * agents[j, A_RADIUS]:
                 if contacts[i, j] == CONTACT_NONE:
                     chance = min(max(min(walkers[i, W_PERMISSIVITY], walkers[j, W_PERMISSIVITY]), 0.0), 1.0)
                     state = CONTACT_PASSING if uniform(rng) < chance else CONTACT_BLOCKED
@@ -84,8 +84,8 @@ def body_circles(agents, walkers, n, legs, circles):
 def touches(agents, circles, i, j):
     """Return whether agent i's disc meets a circle of agent j."""
     for k in range(2 * j, 2 * j + 2):
-        gap = np.hypot(agents[i, A_X] - circles[k, CIRCLE_X], agents[i, A_Y] - circles[k, CIRCLE_Y])
-        if gap < agents[i, A_RADIUS] + circles[k, CIRCLE_RADIUS]:
+        dx, dy = agents[i, A_X] - circles[k, CIRCLE_X], agents[i, A_Y] - circles[k, CIRCLE_Y]
+        if np.sqrt(dx * dx + dy * dy) < agents[i, A_RADIUS] + circles[k, CIRCLE_RADIUS]:
             return True
     return False
 
@@ -143,10 +143,13 @@ def swept_cells(maps, map_row, ax, ay, bx, by, reach):
     start = int(map_row[T_CELLS])
     i = min(max(int((ax - x0) / resolution), 0), width - 1)
     j = min(max(int((ay - y0) / resolution), 0), height - 1)
-    sure = abs(np.float64(maps.distance[start + i * height + j])) - 1.5 * resolution - np.hypot(bx - ax, by - ay)
+    way = np.hypot(bx - ax, by - ay)
+    nearest = abs(np.float64(maps.distance[start + i * height + j]))
+    sure = nearest - 1.5 * resolution - way
     if sure >= reach:
         return min(best, sure)
-    limit = min(best, reach)
+    # some solid square is at most this far from a
+    limit = min(best, reach, nearest + resolution)
     low_i = max(int(np.floor((min(ax, bx) - limit - x0) / resolution)), 0)
     high_i = min(int(np.floor((max(ax, bx) + limit - x0) / resolution)), width - 1)
     low_j = max(int(np.floor((min(ay, by) - limit - y0) / resolution)), 0)
@@ -154,11 +157,17 @@ def swept_cells(maps, map_row, ax, ay, bx, by, reach):
     square = limit * limit
     found = False
     for i in range(low_i, high_i + 1):
-        for j in range(low_j, high_j + 1):
-            if maps.solid[start + i * height + j]:
+        row = start + i * height
+        j = low_j
+        while j <= high_j:
+            if maps.solid[row + j]:
                 left, bottom = x0 + i * resolution, y0 + j * resolution
                 d = _segment_box_sq(ax, ay, bx, by, left, bottom, left + resolution, bottom + resolution)
                 if d < square:
                     square = d
                     found = True
+                j += 1
+            else:  # no solid cell is nearer than the distance field says
+                free = min(abs(maps.distance[row + j]), np.float32(1e6)) / np.float32(resolution)
+                j += max(int(free), 1)
     return np.sqrt(square) if found else max(limit, min(best, sure))

@@ -205,8 +205,8 @@ def _clearances(agents, walkers, scalars, n, maps, map_row, rules, i):
     human = np.inf
     for j in range(n):
         if j != i:
-            gap = np.hypot(agents[j, A_X] - agents[i, A_X], agents[j, A_Y] - agents[i, A_Y])
-            human = min(human, gap - agents[i, A_RADIUS] - agents[j, A_RADIUS])
+            dx, dy = agents[j, A_X] - agents[i, A_X], agents[j, A_Y] - agents[i, A_Y]
+            human = min(human, np.sqrt(dx * dx + dy * dy) - agents[i, A_RADIUS] - agents[j, A_RADIUS])
     x, y, radius = agents[i, A_X], agents[i, A_Y], agents[i, A_RADIUS]
     static = swept_cells(maps, map_row, x, y, x, y, radius + CLEARANCE_REACH) - radius
     if i == 0 or human < scalars[S_CLEAR_HUMAN]:

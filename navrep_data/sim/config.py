@@ -148,7 +148,7 @@ class SimConfig:
         for name in ("max_velocity", "robot_acceleration", "robot_jerk"):
             object.__setattr__(self, name, _triple(name, getattr(self, name)))
         _one_of("on_collision", self.on_collision, ON_COLLISION)
-        _number("max_damage", self.max_damage, 0.0, 1e6)
+        _number("max_damage", self.max_damage, 0.001, 1e6)
         if self.goal_radius is not None:
             _number("goal_radius", self.goal_radius, 0.01, 10.0)
         _one_of("curriculum", self.curriculum, CURRICULA)

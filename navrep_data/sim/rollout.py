@@ -221,7 +221,7 @@ class CallableRollout:
             raise _no_world(a.config, sequences[0])
         pending = np.zeros(n, np.int64)
         gave_up = np.zeros(n, np.bool_)
-        result = np.zeros(2)
+        result = np.zeros(2)  # reward and event of one robot
         length = self.settings.length
         reset = getattr(self.policy, "reset", None)
         if reset is not None:
@@ -266,7 +266,25 @@ class CallableRollout:
         return np.concatenate([rows, np.repeat(rows[:1], missing, axis=0)])
 
 
+def check_rings(config: SimConfig, rings: bool) -> None:
+    """Refuse the rings column for a sensor that does not look once around, starting straight ahead.
+
+    Raises
+    ------
+    ConfigError
+        Naming the sensor's fields.
+    """
+    sensor = config.sensor
+    if rings and not (sensor.covers_full_turn() and abs(sensor.angle_min) <= sensor.angle_increment):
+        span = np.rad2deg(sensor.n_rays * sensor.angle_increment)
+        raise ConfigError(
+            f"rings=True with sensor.n_rays={sensor.n_rays} over {span:.0f} degrees from sensor.angle_min="
+            f"{sensor.angle_min:g}: rings need rays once around from straight ahead; leave the column out (--no-rings)."
+        )
+
+
 def _prepare(arrays: WorldArrays, settings: RolloutSettings) -> None:
+    check_rings(arrays.config, settings.rings)
     arrays.flags[lay.F_SCAN_MM] = settings.scan_dtype == "uint16"
     arrays.flags[lay.F_WANT_HUMANS] = settings.humans
 

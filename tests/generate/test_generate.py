@@ -388,3 +388,30 @@ def test_estimate_is_close(tmp_path):
     value, unit = said.split()
     estimate = float(value) * {"kB": 1e3, "MB": 1e6}[unit]
     assert abs(estimate / result.bytes - 1) < 0.15
+
+
+def test_datasets_of_before_there_were_more_settings_go_on(tmp_path):
+    """A manifest that does not name later settings stands for their defaults, and only for those."""
+    out = tmp_path / "d"
+    generate(env="navrep-train", n=2, out=out, **SMALL)
+    stored = json.loads((out / "manifest.json").read_text())["config"]
+    assert sorted(stored) == [
+        "crossing", "env", "humans", "obstacles", "physics", "polygon_scale", "rendering", "sensor", "time_limit",
+    ]  # fmt: skip
+    before = tree(out)
+    generate(env="navrep-train", n=2, out=out, **SMALL)
+    assert tree(out) == before
+    manifest = json.loads((out / "manifest.json").read_text())
+    manifest["config"]["drive"] = "differential"
+    (out / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(DatasetMismatchError, match="made with drive=differential, asked for drive=holonomic"):
+        generate(env="navrep-train", n=3, out=out, **SMALL)
+
+
+@pytest.mark.parametrize("env", ["cadrl", "empty"])
+def test_worlds_without_polygons_feed_datasets(tmp_path, env):
+    generate(env=env, n=1, out=tmp_path / "d", length=200)
+    assert verify(tmp_path / "d").problems == []
+    with pytest.raises(ConfigError, match="world='empty', obstacles=3 cannot be combined"):
+        generate(env=env, n=1, out=tmp_path / "e", obstacles=3)
+    assert not (tmp_path / "e").exists()
