@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from navrep_data.evaluate._on_maps import guided_robots, start_gaps, states_on_maps
 from navrep_data.schema import ROBOT_STATE_SIZE
-from navrep_data.sim import SimConfig, Simulator
+from navrep_data.sim import SimConfig, Simulator, scale_actions
 from navrep_data.sim import _layout as lay
 from navrep_data.sim._fast_marching import march
 from navrep_data.sim.map_tables import RADIUS
@@ -63,7 +63,7 @@ class ScenarioWorlds:
 
     def step(self, actions: F64) -> NDArray[np.uint8]:
         """Execute actions as shares of the largest velocity."""
-        events = self.simulator.step(actions * self._config.max_velocity)[1]
+        events = self.simulator.step(scale_actions(self._config, actions))[1]
         self._gaps[0] = self._state.agents[:, 0, lay.A_CLEAR_HUMAN]
         self._gaps[1] = self._state.agents[:, 0, lay.A_CLEAR_STATIC]
         return events

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from navrep_data.evaluate._polygons import orca_robots, polygon_gaps
 from navrep_data.schema import SensorContract
-from navrep_data.sim import SimConfig, Simulator
+from navrep_data.sim import SimConfig, Simulator, scale_actions
 from navrep_data.sim import _layout as lay
 
 F64 = NDArray[np.float64]
@@ -66,7 +66,7 @@ class Worlds(Protocol):
 
 
 class PolygonWorlds:
-    """Worlds of procedural polygons: an action of 1 is 1 m/s.
+    """Worlds of procedural polygons: an action of 1 is 1 m/s along each axis.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class PolygonWorlds:
 
     def step(self, actions: F64) -> NDArray[np.uint8]:
         """Execute actions as velocities [m/s, m/s, rad/s]."""
-        return self.simulator.step(actions)[1]
+        return self.simulator.step(scale_actions(self.simulator.config, actions))[1]
 
     def scans(self) -> F32:
         """See :class:`Worlds`."""

@@ -10,7 +10,7 @@ from navrep_data.evaluate.baselines import OrcaPilot
 from navrep_data.evaluate.driver import benchmark
 from navrep_data.evaluate.map_worlds import shortest_path
 from navrep_data.schema import Event
-from navrep_data.sim import Simulator
+from navrep_data.sim import Simulator, scale_actions
 from navrep_data.sim.maps import load_map
 from navrep_data.sim.scenarios import get_scenario, scenario_names
 
@@ -55,7 +55,7 @@ def test_worlds_show_what_the_simulator_shows(physics):
         actions[:, :2] = rng.uniform(-1, 1, (len(CHOSEN), 2))
         events = worlds.step(actions)
         for w, sim in enumerate(single):
-            assert sim.step(0.55 * actions[w : w + 1] * [1, 1, 0])[1][0] == events[w]
+            assert sim.step(scale_actions(config, actions[w : w + 1]))[1][0] == events[w]
 
 
 def slow_shortest(scenario):
