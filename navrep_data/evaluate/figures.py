@@ -23,12 +23,14 @@ Row = dict[str, Any]
 
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#7F7F7F")
 SUCCESS, COLLISION, TIMEOUT = "#0072B2", "#D55E00", "#E69F00"
-OUTCOMES = {"S": (SUCCESS, "goal", ""), "C": (COLLISION, "collision", "x"), "T": (TIMEOUT, "timeout", "s")}
+OUTCOMES = {"S": (SUCCESS, "goal reached", ""), "C": (COLLISION, "collision", "x"), "T": (TIMEOUT, "timeout", "s")}
 """Colour, label and the marker at the end of a trajectory, so that outcomes differ without colour too."""
 PAPER_SCENARIOS = ("rlasl_office_j1", "irosasl_office_j2", "irosunity_scene_map3", "irosasl2")
 """Columns of the paper's figure: simplest and global planning on the realistic map, everything on the complex one,
 global planning on the simple one."""
 MAX_ROWS = 8
+PANEL_CELLS = 220
+"""Cells of a map across a panel: about as many as it has pixels."""
 DPI = 150
 
 
@@ -196,11 +198,24 @@ def overlay(found: Sequence[Results], rows: Sequence[Row]) -> Any:
     return figure
 
 
+def _thick(solid: Any, extent: Sequence[float], width: float) -> tuple[Any, tuple[float, float, float, float]]:
+    """Return a map and its extent in blocks of cells, solid where one cell is: walls of one cell would not be seen."""
+    x0, x1, y0, _ = extent
+    resolution = (x1 - x0) / solid.shape[0]
+    block = max(1, round(width / resolution / PANEL_CELLS))
+    columns, rows = (-(-n // block) for n in solid.shape)
+    padded = np.zeros((columns * block, rows * block), np.bool_)
+    padded[: solid.shape[0], : solid.shape[1]] = solid
+    blocks = padded.reshape(columns, block, rows, block).any(axis=(1, 3))
+    side = block * resolution
+    return blocks, (x0, x0 + columns * side, y0, y0 + rows * side)
+
+
 def _scene(ax: Any, scene: Backdrop, frame: Any) -> None:
     """Draw a scenario's map, humans' starts, start and goal, cut to `frame` (x0, x1, y0, y1)."""
     if scene.occupied is not None:
-        shown = np.where(scene.occupied.T, 0.35, 1.0)
-        ax.imshow(shown, origin="lower", extent=scene.extent, cmap="gray", vmin=0, vmax=1, zorder=1)
+        solid, extent = _thick(scene.occupied, scene.extent, frame[1] - frame[0])
+        ax.imshow(np.where(solid.T, 0.35, 1.0), origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, zorder=1)
     from matplotlib.patches import Circle
 
     for (x, y), moves in zip(scene.humans, scene.moves, strict=True):
