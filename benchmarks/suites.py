@@ -16,12 +16,19 @@ FULL = 300
 
 def played(out: Path, rounds: int, workers: int) -> dict[str, float]:
     """Return the wall time [s] that each policy took."""
-    run = run_tree(
-        [
-            sys.executable, "-m", "navrep_data", "benchmark", *POLICIES, "--suite", "navrep27", "--episodes", str(rounds),
-            "--workers", str(workers), "--out", str(out), "--no-figures", "--json",
-        ]
-    )  # fmt: skip
+    options = [
+        "--suite",
+        "navrep27",
+        "--episodes",
+        rounds,
+        "--workers",
+        workers,
+        "--out",
+        out,
+        "--no-figures",
+        "--json",
+    ]
+    run = run_tree([sys.executable, "-m", "navrep_data", "benchmark", *POLICIES, *map(str, options)])
     seconds: dict[str, float] = json.loads(run.stdout)["seconds"]
     return seconds
 
