@@ -36,7 +36,7 @@ def orca_robots(agents, agents32, scalars, obst_f, obst_i, orca_params, work_f, 
         n = int(scalars[w, S_HUMANS])
         pack_orca(agents[w], n + 1, agents32)
         vx, vy = orca_choice(
-            0, agents[w], agents32, n, obst_f[w, -1], obst_i[w, -1], int(scalars[w, S_OBST_ROBOT]), orca_params,
+            0, agents[w], agents32, 1, n, obst_f[w, -1], obst_i[w, -1], int(scalars[w, S_OBST_ROBOT]), orca_params,
             work_f, work_i,
         )  # fmt: skip
         out[w, 0] = vx

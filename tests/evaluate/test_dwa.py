@@ -65,13 +65,13 @@ def test_clearance_is_that_of_a_forward_simulation(seed):
 
 def test_near_points_are_the_nearest_of_their_rays():
     scan = np.full(RAYS, 25.0, np.float32)
-    scan[[5, 6]] = 2.0, 1.5
+    scan[[6, 8]] = 2.0, 1.5
     scan[40] = 9.0
     scan[80] = 0.0  # invalid
     points = np.zeros((RAYS, 2))
     n = _dwa.near_points(scan, 4.0, settings(), points)
     assert n == 1
-    assert points[0] == pytest.approx([1.5 * math.cos(ANGLES[6]), 1.5 * math.sin(ANGLES[6])])
+    assert points[0] == pytest.approx([1.5 * math.cos(ANGLES[8]), 1.5 * math.sin(ANGLES[8])])
 
 
 def test_heads_for_the_target_in_the_open_at_the_windows_edge_then_at_full_speed():
