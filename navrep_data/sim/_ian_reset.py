@@ -125,7 +125,7 @@ def _clear_of(agents, n, x, y, gap):
 
 @kernel
 def _nth_spot(agents, n, maps, map_row, gap, x, y, least, rng):
-    """Draw a spot off agents 0 .. n - 1 by `gap` and farther than `least` from (x, y); returns its row, -1: there is none.
+    """Draw a spot off agents 0 .. n - 1 by `gap`, farther than `least` from (x, y); returns its row, -1: there is none.
 
     The original's way: one draw among those that are left.
     """

@@ -1,5 +1,6 @@
 """Datasets as files: bytes are a function of settings and seed, whatever happens on the way."""
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -372,8 +373,6 @@ def test_shard_size_is_bounded_by_memory(tmp_path):
 
 def test_long_ranges_choose_float32_and_refuse_millimetres():
     config = driver.make_config("soadrl")
-    import dataclasses
-
     far = dataclasses.replace(config, sensor=dataclasses.replace(config.sensor, range_max=100.0))
     assert plan.check_settings(far, 10, None, True, True).scan_dtype == "float32"
     assert plan.check_settings(config, 10, None, True, True).scan_dtype == "uint16"
@@ -401,9 +400,8 @@ def test_datasets_of_before_there_were_more_settings_go_on(tmp_path):
     before = tree(out)
     generate(env="navrep-train", n=2, out=out, **SMALL)
     assert tree(out) == before
-    manifest = json.loads((out / "manifest.json").read_text())
-    manifest["config"]["drive"] = "differential"
-    (out / "manifest.json").write_text(json.dumps(manifest))
+    old = Manifest.read(out)
+    dataclasses.replace(old, config={**old.config, "drive": "differential"}).save(out)
     with pytest.raises(DatasetMismatchError, match="made with drive=differential, asked for drive=holonomic"):
         generate(env="navrep-train", n=3, out=out, **SMALL)
 

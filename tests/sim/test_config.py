@@ -40,7 +40,17 @@ EXAMPLES = [
     {"physics": "original", "robots": 2},
     {"physics": "original", "on_collision": "damage"},
     {"physics": "original", "rendering": "ellipse"},
-]
+    {"world": "map", "maps": ("asl",), "scenarios": ("rlasl1",)},
+    {"world": "map", "scenarios": ("rlasl1",)},
+    {"world": "map", "scenarios": ("rlasl1",), "humans": 0, "robots": 2},
+    {"world": "map", "maps": ("asl",)},
+    {"physics": "original", "world": "map", "maps": ("asl",), "obstacles": 0},
+    {"physics": "original", "world": "map", "maps": ("asl",), "obstacles": 0, "human_policy": "planned"},
+    {
+        "physics": "original", "world": "map", "maps": ("asl",), "obstacles": 0, "humans": 0,
+        "human_policy": "planned", "robots": 2, "on_collision": "damage",
+    },
+]  # fmt: skip
 
 
 def test_stored_configs_of_older_settings_have_not_changed():
@@ -56,7 +66,7 @@ def test_configs_survive_json():
     assert {*OTHERWISE} - {*stored} == set()
     assert stored["max_velocity"] == [0.5, 0.4, 2.0]
     assert SimConfig.from_dict(json.loads(json.dumps(config.full_dict()))) == config
-    on_map = SimConfig(world="map", maps=["asl", "/own/map"], human_policy="planned")
+    on_map = SimConfig(world="map", maps=["asl", "/own/map"], obstacles=0, human_policy="planned")
     assert SimConfig.from_dict(json.loads(json.dumps(on_map.to_dict()))).maps == ("asl", "/own/map")
 
 
