@@ -42,6 +42,7 @@ def test_json_is_one_object_with_results(played):
     assert {"python", "numpy", "numba"} <= set(value["versions"])
 
 
+@pytest.mark.slow
 def test_redraw_prints_the_table(played):
     done = run("--redraw", played[0] / "navreptest-original", "--no-figures")
     assert done.returncode == 0, done.stderr
@@ -56,9 +57,9 @@ def test_redraw_prints_the_table(played):
     [
         (["gaol"], "Unknown policy 'gaol'. Did you mean 'goal'?"),
         ([], "No policy named, expected at least one"),
-        (["goal", "--suite", "navrep26"], "Did you mean 'navrep27'?"),
-        (["goal", "--redraw", "."], "--redraw plays nothing"),
-        (["--redraw", "nowhere"], "holds no results"),
+        pytest.param(["goal", "--suite", "navrep26"], "Did you mean 'navrep27'?", marks=pytest.mark.slow),
+        pytest.param(["goal", "--redraw", "."], "--redraw plays nothing", marks=pytest.mark.slow),
+        pytest.param(["--redraw", "nowhere"], "holds no results", marks=pytest.mark.slow),
     ],
 )
 def test_errors_are_one_line(arguments, words, tmp_path):

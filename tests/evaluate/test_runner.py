@@ -41,6 +41,7 @@ def test_episodes_do_not_depend_on_the_batch_or_on_who_is_played_beside_them(pol
         assert all(same(one[k], e) for k, e in other.items())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["pilots_for_tests:sideways", "pilots_for_tests:Counting"])
 def test_functions_see_64_rows_so_their_episodes_do_not_depend_on_the_batch_either(policy):
     one = played(policy, range(9), batch=1)
@@ -155,6 +156,7 @@ def test_changed_settings_are_refused_and_damaged_files_too(tmp_path):
             benchmark(["goal"], episodes=4, out=tmp_path, figures=False)
 
 
+@pytest.mark.slow
 def test_redraw_writes_the_same_report_and_figures_without_playing(tmp_path):
     report = benchmark(["goal", "random"], episodes=6, out=tmp_path)
     folder = tmp_path / "navreptest-original"
@@ -183,7 +185,7 @@ def test_variants_with_several_runs_get_a_line_of_their_own(tmp_path):
         return results
 
     found = [made_up("goal", "SCCT"), made_up("net.1", "SSCC"), made_up("net.2", "SSST")]
-    report = write_report(found, tmp_path, figures=True)
+    report = write_report(found, tmp_path, figures=False)
     (group,) = report.variants
     assert (group["variant"], group["runs"]) == ("net", ["net.1", "net.2"])
     assert (group["success_rate"], group["success_rate_min"], group["success_rate_max"]) == (0.625, 0.5, 0.75)
