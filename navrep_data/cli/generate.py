@@ -93,8 +93,8 @@ def generate_command(
     result = generate(
         env=env, n=n, out=out, seed=seed, workers=_cores() if workers is None else workers, length=length,
         physics=physics, humans=humans, obstacles=obstacles, legs=legs, maps=maps or None, policy=policy,
-        policy_batch=policy_batch, shard_size=shard_size, scan_dtype=scan_dtype, rings=rings, humans_column=humans_column,
-        progress=show_progress(), report=say_err if as_json else say,
+        policy_batch=policy_batch, shard_size=shard_size, scan_dtype=scan_dtype, rings=rings,
+        humans_column=humans_column, progress=show_progress(), report=say_err if as_json else say,
     )  # fmt: skip
     if as_json:
         print_json(result.to_dict())

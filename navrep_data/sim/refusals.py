@@ -34,32 +34,6 @@ REFUSALS: tuple[_Rule, ...] = (
         "a map world needs a map; name one in maps, or a scenario in scenarios",
     ),
     (
-        ("world", "human_policy"),
-        lambda c: c.world != "map" and c.human_policy == "planned",
-        "planned humans walk on a map; set world='map', or human_policy='orca'",
-    ),
-    (
-        ("world", "curriculum"),
-        lambda c: c.world == "map" and c.curriculum == "adaptive",
-        "a map world has no number of obstacles to adapt; set curriculum='constant'",
-    ),
-    (
-        ("physics", "world", "robots"),
-        lambda c: c.physics == "original" and c.world != "map" and c.robots > 1,
-        "the released software has one robot there; set physics='consistent', or robots=1",
-    ),
-    (
-        ("physics", "world", "on_collision"),
-        lambda c: c.physics == "original" and c.world != "map" and c.on_collision == "damage",
-        "every collision ends the episode in the released software there; set physics='consistent', or "
-        "on_collision='end'",
-    ),
-    (
-        ("physics", "rendering"),
-        lambda c: c.physics == "original" and c.rendering == "ellipse",
-        "the released software draws legs or trunks; set physics='consistent', or rendering='legs'",
-    ),
-    (
         ("maps", "scenarios"),
         lambda c: bool(c.maps) and bool(c.scenarios),
         "scenarios name their maps themselves; leave one of the two empty",
@@ -94,6 +68,32 @@ REFUSALS: tuple[_Rule, ...] = (
         lambda c: c.physics == "original" and c.world == "map" and c.robots > 1 and c.on_collision == "damage",
         "every collision of one robot ends the episode of all in the released software; set physics='consistent', or "
         "on_collision='end'",
+    ),
+    (
+        ("world", "human_policy"),
+        lambda c: c.world != "map" and c.human_policy == "planned",
+        "planned humans walk on a map; set world='map', or human_policy='orca'",
+    ),
+    (
+        ("world", "curriculum"),
+        lambda c: c.world == "map" and c.curriculum == "adaptive",
+        "a map world has no number of obstacles to adapt; set curriculum='constant'",
+    ),
+    (
+        ("physics", "world", "robots"),
+        lambda c: c.physics == "original" and c.world != "map" and c.robots > 1,
+        "the released software has one robot there; set physics='consistent', or robots=1",
+    ),
+    (
+        ("physics", "world", "on_collision"),
+        lambda c: c.physics == "original" and c.world != "map" and c.on_collision == "damage",
+        "every collision ends the episode in the released software there; set physics='consistent', or "
+        "on_collision='end'",
+    ),
+    (
+        ("physics", "rendering"),
+        lambda c: c.physics == "original" and c.rendering == "ellipse",
+        "the released software draws legs or trunks; set physics='consistent', or rendering='legs'",
     ),
 )
 """(fields, condition, reason with advice) of every combination that is refused."""
