@@ -11,7 +11,7 @@ from navrep_data.evaluate._on_maps import guided_robots, start_gaps, states_on_m
 from navrep_data.schema import ROBOT_STATE_SIZE
 from navrep_data.sim import SimConfig, Simulator, scale_actions
 from navrep_data.sim import _layout as lay
-from navrep_data.sim._fast_marching import march
+from navrep_data.sim._fast_marching import UPWIND_FINAL, march
 from navrep_data.sim.map_tables import RADIUS
 from navrep_data.sim.maps import load_map
 from navrep_data.sim.scenarios import get_scenario
@@ -143,7 +143,7 @@ def shortest_path(scenario: str) -> float:
     speeds = padded.reshape(width // block, block, height // block, block).any(axis=(1, 3)).astype(np.float32)
     start, goal = (grid.cell_of(xy) // block for xy in (recipe.starts[:1, :2], recipe.goals[:1]))
     field = np.empty(speeds.shape, np.float32)
-    march(speeds, int(goal[0, 0]), int(goal[0, 1]), field)
+    march(speeds, int(goal[0, 0]), int(goal[0, 1]), UPWIND_FINAL, field)
     straight = float(np.hypot(*(recipe.goals[0] - recipe.starts[0, :2])))
     found = float(field[start[0, 0], start[0, 1]]) * block * grid.resolution
     # the start lies closer to a wall than the robot's radius, by less than a cell: there is no better bound then
