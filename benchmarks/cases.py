@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from harness import Timing, cores, in_turns, ratio, run_tree, spread
+from suites import navrep27
 
 Row = dict[str, Any]
 GENERATE = [sys.executable, "-m", "navrep_data", "generate", "--env", "soadrl", "--json"]
@@ -390,4 +391,8 @@ def first_row(effort: Effort) -> list[Row]:
     ]
 
 
-OUTSIDE: dict[str, Callable[[Effort], list[Row]]] = {"generate-wall": generate_wall, "first-row": first_row}
+OUTSIDE: dict[str, Callable[[Effort], list[Row]]] = {
+    "generate-wall": generate_wall,
+    "first-row": first_row,
+    "navrep27": navrep27,
+}

@@ -54,4 +54,7 @@ TARGETS: dict[str, Target] = {
     "generate-memory": Target("peak memory of `generate`, all processes", "GB", 1.5, 0.8, more=False),
     "first-row": Target("first row on disk in a fresh process, kernels cached", "s", 2.0, more=False),
     "first-row-memory": Target("... in memory", "s", more=False),
+    "navrep27-goal": Target("`benchmark --suite navrep27`, 300 per scenario: `goal`, wall", "s", 300, more=False),
+    "navrep27-orca": Target("... `orca`", "s", 300, more=False),
+    "navrep27-dwa": Target("... `dwa`", "s", 900, more=False),
 }

@@ -17,6 +17,7 @@ __all__ = [
     "datasets",
     "envs",
     "errors",
+    "evaluate",
     "generate",
     "io",
     "models",

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from navrep_data._version import __version__
-from navrep_data.cli import generate, import_npz, info, models, play, verify
+from navrep_data.cli import benchmark, generate, import_npz, info, models, play, verify
 from navrep_data.errors import NavrepDataError, did_you_mean
 
 app = typer.Typer(
@@ -21,6 +21,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("generate")(generate.generate_command)
+app.command("benchmark")(benchmark.benchmark_command)
 app.command("info")(info.info_command)
 app.command("verify")(verify.verify_command)
 app.command("import-npz")(import_npz.import_npz_command)

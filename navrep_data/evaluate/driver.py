@@ -1,0 +1,259 @@
+"""Play policies in a suite, and write results, tables and figures."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from navrep_data.errors import ConfigError, DatasetNotFoundError
+from navrep_data.evaluate import tables
+from navrep_data.evaluate.executors import Job, run
+from navrep_data.evaluate.policies import PilotSpec, resolve_policy
+from navrep_data.evaluate.results import Results, file_name, header_of, open_results
+from navrep_data.evaluate.scores import by_variant, summary
+from navrep_data.evaluate.suites import Suite, get_suite
+from navrep_data.io import atomic_write_bytes, translate_os_error
+
+PHYSICS = ("original", "consistent")
+SAVE_SECONDS = 2.0
+"""The results file is written this often at most while episodes finish."""
+MAX_WORKERS = 1024
+
+Progress = Callable[[str, int, int], None]
+"""Called with a policy's name, how many of its episodes are finished, and of how many."""
+
+
+@dataclass
+class Benchmark:
+    """What :func:`benchmark` returns.
+
+    Attributes
+    ----------
+    rows : list of dict
+        One per policy, in the order asked for; see :func:`navrep_data.evaluate.scores.summary`.
+    variants : list of dict
+        Variants of which several runs were played.
+    baseline : dict
+        The row of `goal`, asked for or not.
+    text : str
+        The report as Markdown.
+    files : list of Path
+        What was written.
+    seconds : dict of str to float
+        Wall time that each policy took just now [s]; 0 where nothing was left to play.
+    """
+
+    rows: list[dict[str, Any]]
+    variants: list[dict[str, Any]]
+    baseline: dict[str, Any]
+    text: str
+    files: list[Path] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return results as ``--json`` prints them."""
+        rows = [{**r, "goal_success_rate": self.baseline["success_rate"]} for r in self.rows]
+        return {
+            "results": rows,
+            "variants": self.variants,
+            "baseline": self.baseline,
+            "files": [str(f) for f in self.files],
+            "seconds": self.seconds,
+        }
+
+
+def benchmark(
+    policies: Sequence[str | Callable[[Any, Any], Any]],
+    suite: str = "navreptest",
+    physics: str | None = None,
+    episodes: int | None = None,
+    workers: int = 1,
+    inference: str = "deterministic",
+    source: str | os.PathLike[str] | None = None,
+    out: str | os.PathLike[str] = "benchmark",
+    figures: bool = True,
+    batch: int | None = None,
+    progress: Progress | None = None,
+) -> Benchmark:
+    """Play policies in a suite; the same call goes on after an interruption, or with more episodes.
+
+    Parameters
+    ----------
+    policies : sequence of str or callable
+        Baselines (``goal``, ``random``, ``orca``, ``dwa``), names of the zoo, ``module:function``, or callables
+        ``(scan (64, 1080), robot_state (64, 5)) -> action (64, 2 or 3)`` in [-1, 1]. `goal` is always played.
+    suite : str
+        ``"navreptest"`` or ``"navrep27"``.
+    physics : str, optional
+        ``"original"`` (the suites' default) or ``"consistent"``.
+    episodes : int, optional
+        Episodes per scenario; the suite's own number by default.
+    workers : int
+        Processes; numbers do not depend on it.
+    inference : str
+        ``"deterministic"``, or ``"as_released"``: the zoo's memories with the noise that they were trained with.
+    source : path-like or str, optional
+        Folder or address with the zoo's files.
+    out : path-like
+        Results, tables and figures go to ``out/SUITE-PHYSICS/``.
+    figures : bool
+        Whether to draw.
+    batch : int, optional
+        Worlds per process; numbers do not depend on it.
+    progress : callable, optional
+        See :data:`Progress`.
+
+    Returns
+    -------
+    Benchmark
+
+    Raises
+    ------
+    UnknownNameError, ConfigError, PolicyError
+        If a name or setting cannot be used.
+    DatasetMismatchError
+        If `out` holds results of other settings.
+    """
+    chosen = get_suite(suite)
+    kind = chosen.physics if physics is None else physics
+    _check(kind, workers, batch, policies)
+    total = chosen.total(episodes)
+    specs = list(
+        {s.name: s for s in (resolve_policy(p, source, inference, bool(chosen.maps)) for p in policies)}.values()
+    )
+    specs = [s if s.kind == "zoo" else _plain(s) for s in specs]
+    everybody = specs if any(s.name == "goal" for s in specs) else [resolve_policy("goal"), *specs]
+    folder = Path(out) / f"{chosen.name}-{kind}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise translate_os_error(error, folder) from error
+    # settings are compared before the first episode is played
+    opened = [(s, open_results(folder / file_name(s), header_of(s, chosen, kind))) for s in everybody]
+    seconds, found = {}, {}
+    for spec, results in opened:
+        begun = time.perf_counter()
+        played = _play(chosen, kind, spec, results, total, folder / file_name(spec), workers, batch, progress)
+        seconds[spec.name] = round(time.perf_counter() - begun, 2) if played else 0.0
+        found[spec.name] = results.first(total)
+    report = write_report(list(found.values()), folder, figures, [s.name for s in specs])
+    report.files = [*(folder / file_name(s) for s in everybody), *report.files]
+    report.seconds = seconds
+    return report
+
+
+def _plain(spec: PilotSpec) -> PilotSpec:
+    """Return a spec without network, for which `inference` means nothing."""
+    return PilotSpec(spec.name, spec.sees, spec.variant, spec.kind, files=spec.files, function=spec.function)
+
+
+def _check(physics: str, workers: int, batch: int | None, policies: Sequence[Any]) -> None:
+    if physics not in PHYSICS:
+        raise ConfigError(f"physics is {physics!r}, expected one of: {', '.join(PHYSICS)}.")
+    for name, value, most in (("workers", workers, MAX_WORKERS), ("batch", 1 if batch is None else batch, 4096)):
+        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+            raise ConfigError(f"{name} is {value!r}, expected a whole number from 1 to {most}.")
+    if not policies or isinstance(policies, str):
+        raise ConfigError(f"policies is {policies!r}, expected a list of names, for example ['goal', 'dwa'].")
+
+
+def _play(
+    suite: Suite,
+    physics: str,
+    spec: PilotSpec,
+    results: Results,
+    total: int,
+    path: Path,
+    workers: int,
+    batch: int | None,
+    progress: Progress | None,
+) -> bool:
+    """Play what is missing, saving as episodes finish; returns whether anything was."""
+    todo = results.missing(total)
+    if not todo:
+        return False
+    job = Job(suite.name, physics, spec, tuple(todo), spec.inference == "as_released" and spec.kind == "zoo", batch)
+    done, saved = total - len(todo), time.monotonic()
+    try:
+        for finished in run(job, workers):
+            results.add(finished)
+            done += len(finished)
+            if progress is not None:
+                progress(spec.name, done, total)
+            if finished and time.monotonic() - saved > SAVE_SECONDS:
+                results.save(path)
+                saved = time.monotonic()
+    finally:
+        results.save(path)
+    return True
+
+
+def write_report(
+    found: Sequence[Results], folder: Path, figures: bool = True, names: Sequence[str] | None = None
+) -> Benchmark:
+    """Write tables and figures of results, without playing anything.
+
+    Parameters
+    ----------
+    found : sequence of Results
+        Of policies in one suite and physics; `goal` among them is the baseline.
+    folder : pathlib.Path
+        Where to.
+    figures : bool
+        Whether to draw.
+    names : sequence of str, optional
+        Only these in tables and figures.
+    """
+    chosen = [r for r in found if names is None or r.header["name"] in names]
+    rows = {r.name: summary(r) for r in found}
+    baseline = next((row for r, row in zip(found, rows.values(), strict=True) if r.header["name"] == "goal"), None)
+    if baseline is None:
+        raise DatasetNotFoundError(f"{folder} has no results of 'goal', expected them beside every score: play it too.")
+    mine = [rows[r.name] for r in chosen]
+    groups = by_variant(mine)
+    text = tables.report(mine, groups, baseline, chosen[0].suite.text)
+    report = Benchmark(mine, groups, baseline, text)
+    atomic_write_bytes(folder / "report.md", text.encode())
+    report.files.append(folder / "report.md")
+    if figures:
+        from navrep_data.evaluate.figures import draw
+
+        report.files += draw(chosen, mine, groups, baseline, folder)
+    return report
+
+
+def redraw(folder: str | os.PathLike[str], figures: bool = True) -> Benchmark:
+    """Write the tables and figures of a folder of results again, without playing anything.
+
+    Parameters
+    ----------
+    folder : path-like
+        ``out/SUITE-PHYSICS`` of an earlier :func:`benchmark`, or one results file in it.
+    figures : bool
+        Whether to draw.
+
+    Raises
+    ------
+    DatasetNotFoundError
+        If there are no results.
+    CorruptDataError
+        If a file is none.
+    """
+    path = Path(folder)
+    files = [path] if path.is_file() else sorted(path.glob("*.json"))
+    if not files:
+        raise DatasetNotFoundError(f"{path} holds no results (*.json), expected OUT/SUITE-PHYSICS of a benchmark.")
+    names = None
+    home = path.parent if path.is_file() else path
+    found = [Results.load(f) for f in files]
+    if path.is_file():
+        names = [found[0].header["name"]]
+        if names != ["goal"] and (home / "goal.json").is_file():
+            found.append(Results.load(home / "goal.json"))
+    if len({(r.suite.name, r.physics) for r in found}) > 1:
+        raise ConfigError(f"{path} holds results of several suites or physics, expected one: move them apart.")
+    return write_report(found, home, figures, names)

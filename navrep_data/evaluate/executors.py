@@ -1,0 +1,148 @@
+"""Play episodes here, or in worker processes that take one episode after the other from a common list."""
+
+from __future__ import annotations
+
+import queue
+import time
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Any
+
+from navrep_data.errors import NavrepDataError, WorkerDiedError
+from navrep_data.evaluate.policies import PilotSpec
+from navrep_data.evaluate.runner import Episode, n_worlds, play, units
+from navrep_data.evaluate.suites import Suite, get_suite
+
+POLL_SECONDS = 0.2
+# workers hand over what they have finished this often, so that little is lost when they are killed
+HAND_OVER_SECONDS = 0.5
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be played by whom.
+
+    Attributes
+    ----------
+    suite, physics : str
+        Names.
+    pilot : PilotSpec
+        Who drives.
+    episodes : tuple of int
+        Numbers of the episodes.
+    grouped : bool
+        See :class:`navrep_data.evaluate.pilots.Pilot`.
+    batch : int or None
+        Worlds per process; None = a good number.
+    """
+
+    suite: str
+    physics: str
+    pilot: PilotSpec
+    episodes: tuple[int, ...]
+    grouped: bool = False
+    batch: int | None = None
+
+    def units(self) -> list[list[int]]:
+        """Return the episodes as they are handed out."""
+        return units(list(self.episodes), self.grouped)
+
+
+def _start(job: Job, suite: Suite, take: Any, count: int) -> Iterator[list[Episode]]:
+    pilot = job.pilot.make(suite.first_seed)
+    worlds = suite.make(suite.config(job.physics), n_worlds(pilot, job.batch, count))
+    return play(suite, worlds, pilot, take)
+
+
+def run(job: Job, workers: int) -> Iterator[list[Episode]]:
+    """Play a job and yield episodes as they end, in any order; empty lists while waiting.
+
+    Parameters
+    ----------
+    job : Job
+        What to play.
+    workers : int
+        Number of processes; 1 = in this one.
+
+    Raises
+    ------
+    WorkerDiedError
+        If a worker process ended without a word.
+    NavrepDataError
+        What went wrong in a worker.
+    """
+    todo = job.units()
+    workers = min(workers, len(todo))
+    if workers > 1:
+        yield from _run_pool(job, workers, len(todo))
+    elif todo:
+        rest = iter(todo)
+        yield from _start(job, get_suite(job.suite), lambda: next(rest, None), len(job.episodes))
+
+
+def _work(job: Job, share: int, taken: Any, results: Any) -> None:
+    """Play in a worker process; `taken` counts the units that somebody has taken."""
+    todo = job.units()
+
+    def take() -> list[int] | None:
+        with taken.get_lock():
+            index = taken.value
+            taken.value += 1
+        return todo[index] if index < len(todo) else None
+
+    try:
+        done: list[Episode] = []
+        due = time.monotonic() + HAND_OVER_SECONDS
+        for finished in _start(job, get_suite(job.suite), take, share):
+            done += finished
+            if done and time.monotonic() > due:
+                results.put(("episodes", done))
+                done, due = [], time.monotonic() + HAND_OVER_SECONDS
+        results.put(("episodes", done))
+        results.put(("end", None))
+    except NavrepDataError as error:
+        results.put(("error", error))
+    except Exception:  # a bug: its traceback must reach the user
+        results.put(("bug", traceback.format_exc()))
+
+
+def _run_pool(job: Job, workers: int, n_units: int) -> Iterator[list[Episode]]:
+    context = get_context("spawn")
+    taken, results = context.Value("q", 0), context.Queue()
+    share = -(-len(job.episodes) // workers)
+    pool = [context.Process(target=_work, args=(job, share, taken, results), daemon=True) for _ in range(workers)]
+    try:
+        for process in pool:
+            process.start()
+        running = workers
+        while running:
+            try:
+                kind, what = results.get(timeout=POLL_SECONDS)
+            except queue.Empty:
+                _check_alive(pool)
+                yield []
+                continue
+            if kind == "error":
+                raise what
+            if kind == "bug":
+                raise WorkerDiedError(f"A worker process failed:\n{what}")
+            running -= kind == "end"
+            if kind == "episodes":
+                yield what
+    finally:
+        for process in pool:
+            if process.pid is not None:
+                process.terminate()
+                process.join()
+        results.close()
+
+
+def _check_alive(pool: list[Any]) -> None:
+    for process in pool:
+        if process.exitcode not in (None, 0):
+            raise WorkerDiedError(
+                f"A worker process died (exit code {process.exitcode}: killed, or out of memory?). What was finished "
+                "is intact; run the same command again, perhaps with fewer --workers."
+            )

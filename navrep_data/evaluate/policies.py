@@ -1,0 +1,131 @@
+"""From names on the command line to what drives robots."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from navrep_data.errors import ConfigError, PolicyError, UnknownNameError, did_you_mean
+from navrep_data.evaluate.baselines import DwaPilot, GoalPilot, OrcaPilot, RandomPilot
+from navrep_data.evaluate.pilots import FunctionPilot, Pilot, ZooPilot, source_hash
+from navrep_data.generate.policy import load_callable
+
+BASELINES: dict[str, type[Pilot]] = {pilot.name: pilot for pilot in (GoalPilot, RandomPilot, OrcaPilot, DwaPilot)}
+"""Policies without weights, by name."""
+
+INFERENCE = ("deterministic", "as_released")
+
+
+@dataclass(frozen=True)
+class PilotSpec:
+    """A policy as results record it, and as worker processes are told to make it.
+
+    Attributes
+    ----------
+    name : str
+        Full name.
+    sees : str
+        See :class:`Pilot`.
+    variant : str
+        What runs of one kind share, such as ``e2e_1d``; the name itself for others.
+    kind : str
+        baseline, zoo or function.
+    source : str or None
+        Where files are looked for first.
+    inference : str
+        deterministic or as_released.
+    files : dict
+        Hashes of what decides its actions, by file.
+    function : callable or None
+        Where one was passed in.
+    """
+
+    name: str
+    sees: str
+    variant: str
+    kind: str
+    source: str | None = None
+    inference: str = "deterministic"
+    files: dict[str, str] = field(default_factory=dict)
+    function: Callable[[Any, Any], Any] | None = None
+
+    def make(self, first_seed: int) -> Pilot:
+        """Return the pilot itself; loads weights."""
+        if self.kind == "baseline":
+            return BASELINES[self.name]()
+        if self.kind == "function":
+            return FunctionPilot(self.name, self.function or load_callable(self.name))
+        import torch
+
+        from navrep_data.zoo import load
+
+        torch.set_num_threads(1)  # so that numbers do not depend on the number of cores; workers are the parallelism
+        return ZooPilot(load(self.name, source=self.source, inference=self.inference), first_seed)
+
+
+def resolve_policy(
+    policy: str | Callable[[Any, Any], Any],
+    source: str | os.PathLike[str] | None = None,
+    inference: str = "deterministic",
+    on_maps: bool = False,
+) -> PilotSpec:
+    """Return what a name stands for.
+
+    Parameters
+    ----------
+    policy : str or callable
+        A baseline's name, a name of the zoo, ``module:function``, or a callable (scan, robot_state) -> action.
+    source : path-like or str, optional
+        Folder or address with the zoo's files.
+    inference : str
+        For the zoo's memories.
+    on_maps : bool
+        Whether it will drive in worlds on maps, where baselines are told the planned way.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such policy.
+    ConfigError
+        If `inference` is unknown.
+    PolicyError
+        If the name is that of a network that is no policy.
+    """
+    if inference not in INFERENCE:
+        raise ConfigError(f"inference is {inference!r}, expected one of: {', '.join(INFERENCE)}.")
+    if not isinstance(policy, str):
+        kind = policy if hasattr(policy, "__qualname__") else type(policy)
+        name = f"{kind.__module__}:{kind.__qualname__}"
+        return PilotSpec(name, "scan", name, "function", files=_hashes(policy), function=policy)
+    if policy in BASELINES:
+        pilot = BASELINES[policy]
+        return PilotSpec(policy, (on_maps and pilot.sees_on_maps) or pilot.sees, policy, "baseline")
+    if ":" in policy:
+        return PilotSpec(policy, "scan", policy, "function", files=_hashes(load_callable(policy)))
+    return _from_zoo(policy, None if source is None else os.fspath(source), inference)
+
+
+def _hashes(function: Callable[..., Any]) -> dict[str, str]:
+    digest = source_hash(function)
+    return {"source": digest} if digest else {}
+
+
+def _from_zoo(name: str, source: str | None, inference: str) -> PilotSpec:
+    from navrep_data.zoo import registry
+
+    if name.partition(".")[0] not in registry.variants():
+        known = [*BASELINES, *registry.full_names(), *registry.variants()]
+        raise UnknownNameError(
+            f"Unknown policy {name!r}.{did_you_mean(name, known)} Baselines: {', '.join(BASELINES)}; networks: "
+            "navrep-data models; your own: module:function."
+        )
+    record = registry.resolve(name)
+    if record.kind != "policy":
+        raise PolicyError(
+            f"{record.name} is a {record.kind.replace('_', ' ')}, expected a policy: it does not choose actions from "
+            "scans. List them: navrep-data models"
+        )
+    files = {e.path: e.sha256 or f"git:{e.git_blob_sha1}" for r in registry.with_parts(record) for e in r.files}
+    return PilotSpec(record.name, "scan", record.variant, "zoo", source, inference, files)

@@ -1,0 +1,189 @@
+"""The benchmark's suites: which numbered episodes, in which worlds."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from navrep_data.errors import ConfigError, UnknownNameError, did_you_mean
+from navrep_data.evaluate.map_worlds import ScenarioWorlds
+from navrep_data.evaluate.worlds import PolygonWorlds, Worlds
+from navrep_data.io import json_bytes
+from navrep_data.sim import SimConfig, make_config
+from navrep_data.sim.maps import load_map
+from navrep_data.sim.scenarios import MAP_GROUPS, get_scenario, scenario_names
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One recipe for worlds of a suite.
+
+    Attributes
+    ----------
+    name : str
+        As in results.
+    map : str
+        Name of its map, empty for procedural worlds.
+    """
+
+    name: str
+    map: str = ""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A numbered list of episodes that every policy plays.
+
+    Attributes
+    ----------
+    name : str
+        ``navreptest`` or ``navrep27``.
+    text : str
+        One line on what it is.
+    physics : str
+        Default physics.
+    scenarios : tuple of Scenario
+        Episode k plays scenario ``k % len(scenarios)``.
+    rounds : int
+        Default number of episodes per scenario.
+    max_rounds : int
+        Largest number of episodes per scenario.
+    first_seed : int
+        Episode k is drawn from numpy seed ``first_seed + k``.
+    max_steps : int
+        More than any episode has.
+    config : callable
+        ``config(physics)`` returns the simulator's.
+    make : callable
+        ``make(config, n)`` returns n :class:`Worlds`.
+    data_hash : callable
+        Returns the hash of scenario data and maps, empty where everything is in the config.
+    """
+
+    name: str
+    text: str
+    physics: str
+    scenarios: tuple[Scenario, ...]
+    rounds: int
+    max_rounds: int
+    first_seed: int
+    max_steps: int
+    config: Callable[[str], SimConfig]
+    make: Callable[[SimConfig, int], Worlds]
+    data_hash: Callable[[], str]
+
+    @property
+    def maps(self) -> tuple[str, ...]:
+        """The maps of its scenarios, in the paper's order; empty for procedural worlds."""
+        return tuple(m for m in MAP_GROUPS if any(s.map == m for s in self.scenarios))
+
+    def seed(self, episode: int) -> int:
+        """Return the numpy seed of an episode."""
+        return self.first_seed + episode
+
+    def scenario(self, episode: int) -> int:
+        """Return the index of the scenario that an episode plays."""
+        return episode % len(self.scenarios)
+
+    def total(self, episodes: int | None) -> int:
+        """Return how many episodes `episodes` per scenario are (None = the suite's own number).
+
+        Raises
+        ------
+        ConfigError
+            If the suite has no so many.
+        """
+        rounds = self.rounds if episodes is None else episodes
+        if isinstance(rounds, bool) or not isinstance(rounds, int) or not 1 <= rounds <= self.max_rounds:
+            each = "" if len(self.scenarios) == 1 else " per scenario"
+            raise ConfigError(
+                f"episodes is {rounds!r}, expected a whole number from 1 to {self.max_rounds}{each} in {self.name}."
+            )
+        return rounds * len(self.scenarios)
+
+    def settings(self, physics: str) -> dict[str, Any]:
+        """Return what decides an episode, as plain JSON values."""
+        config = self.config(physics).to_dict()
+        return {
+            "suite": self.name,
+            "physics": physics,
+            "first_seed": self.first_seed,
+            "config_sha256": hashlib.sha256(json_bytes(config)).hexdigest(),
+            "data_sha256": self.data_hash(),
+        }
+
+
+def _test_config(physics: str) -> SimConfig:
+    return make_config("navrep-test", physics=physics)
+
+
+NAVREPTEST = Suite(
+    name="navreptest",
+    text="the training environment's test: square crossing, procedural polygons, numpy seeds 1000 + k",
+    physics="original",
+    scenarios=(Scenario("navrep-test"),),
+    rounds=200,
+    max_rounds=500,  # crowd_sim.py: the case counter wraps there
+    first_seed=1000,
+    max_steps=180,
+    config=_test_config,
+    make=PolygonWorlds,
+    data_hash=str,
+)
+
+
+def _ian_config(physics: str) -> SimConfig:
+    return make_config("ian", physics=physics)
+
+
+@cache
+def _scenario_hash() -> str:
+    """Return the hash of all scenarios and of the maps that they lie on."""
+    digest = hashlib.sha256()
+    for name in scenario_names():
+        scenario = get_scenario(name)
+        digest.update(f"{name} {scenario.map} {load_map(scenario.map).hash}".encode())
+        for array in (scenario.starts, scenario.goals, scenario.permissivity):
+            digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+NAVREP27 = Suite(
+    name="navrep27",
+    text="the paper's 27 scenarios on three maps, episode r of scenario i = numpy seed 27 r + i",
+    physics="original",
+    scenarios=tuple(Scenario(name, get_scenario(name).map) for name in scenario_names()),
+    rounds=300,
+    max_rounds=100_000,
+    first_seed=0,
+    max_steps=1001,
+    config=_ian_config,
+    make=ScenarioWorlds,
+    data_hash=_scenario_hash,
+)
+
+_SUITES = {suite.name: suite for suite in (NAVREPTEST, NAVREP27)}
+
+
+def suite_names() -> list[str]:
+    """Return the names of all suites."""
+    return list(_SUITES)
+
+
+def get_suite(name: str) -> Suite:
+    """Return a suite by name.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such suite.
+    """
+    try:
+        return _SUITES[name]
+    except KeyError:
+        raise UnknownNameError(
+            f"Unknown suite {name!r}.{did_you_mean(name, _SUITES)} Known: {', '.join(_SUITES)}."
+        ) from None
