@@ -325,8 +325,7 @@ def _meter(limit: int, show: bool | None) -> type[Any]:
     class Meter(tqdm):
         def __init__(self, *args: Any, **kwargs: Any) -> None:
             self.seen = 0
-            if show is not None:
-                kwargs["disable"] = not show
+            kwargs["disable"] = not (sys.stderr.isatty() if show is None else show)
             super().__init__(*args, **kwargs)  # type: ignore[no-untyped-call]
 
         def update(self, n: float | None = 1) -> bool | None:
@@ -344,7 +343,7 @@ def _meter(limit: int, show: bool | None) -> type[Any]:
 def quiet() -> Iterator[None]:
     """Silence huggingface_hub's bars for uploads where nobody watches stderr, unless the user forced them."""
     from huggingface_hub import constants
-    from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
+    from huggingface_hub.utils.tqdm import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
 
     if sys.stderr.isatty() or constants.HF_HUB_DISABLE_PROGRESS_BARS is not None or are_progress_bars_disabled():
         yield
