@@ -6,6 +6,7 @@ import contextlib
 import random
 import re
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from navrep_data.errors import ConfigError, CorruptDataError, HubError, NavrepDataError, OfflineError
-from navrep_data.io import is_offline, sha256_file, switched_off, translate_os_error
+from navrep_data.io import atomic_write_bytes, is_offline, sha256_file, switched_off, translate_os_error
 from navrep_data.shards import REPO_NAME, FileEntry
 
 Kind = Literal["dataset", "model"]
@@ -93,7 +94,7 @@ def parse_repo(text: str, revision: str | None = None) -> tuple[str, str]:
         raise ConfigError(f"The repository is {text[:120]!r}, expected user/name as on the Hub.")
     if at and revision is not None and found != revision:
         raise ConfigError(f"{text!r} names a revision, and another one is given ({revision!r}): leave one out.")
-    chosen = found if at else revision or "main"
+    chosen = found if at else "main" if revision is None else revision
     if not _REVISION.fullmatch(chosen) or ".." in chosen:
         raise ConfigError(f"The revision is {chosen[:80]!r}, expected a branch, tag or commit.")
     return repo, chosen
@@ -143,12 +144,20 @@ def call(what: str, function: Callable[[], T]) -> T:
 
 
 def _limit_silence() -> None:
-    import httpx2
     from huggingface_hub import get_session
 
     session = get_session()
-    if session.timeout.read is None:  # unless the user chose a client of their own
-        session.timeout = httpx2.Timeout(SILENCE)
+    hooks = session.event_hooks
+    if _bound not in hooks["request"]:
+        session.event_hooks = {**hooks, "request": [*hooks["request"], _bound]}
+
+
+def _bound(request: Any) -> None:
+    """Give a request of huggingface_hub that would wait for ever an end."""
+    given = request.extensions.get("timeout", {})
+    request.extensions["timeout"] = {
+        name: SILENCE if given.get(name) is None else given[name] for name in ("connect", "read", "write", "pool")
+    }
 
 
 def _chain(error: BaseException) -> Iterable[BaseException]:
@@ -207,7 +216,6 @@ def explain(what: str, error: Exception) -> NavrepDataError:
             errors.RemoteEntryNotFoundError,
             "it lacks a file; check that navrep-data wrote it",
         ),
-        (errors.RevisionResolutionError, "the revision is not known on this machine and the Hub cannot be asked"),
         (
             errors.RepositoryNotFoundError,
             "there is no such repository, or it is private; check the name, log in with `hf auth login` (or HF_TOKEN)",
@@ -224,7 +232,7 @@ def explain(what: str, error: Exception) -> NavrepDataError:
         return HubError(f"Cannot {what}: {' '.join(str(first).split())[:300].rstrip('.') or type(first).__name__}.")
     said = " ".join(response.headers.get("x-error-message", "").split())[:200]
     advice = {
-        401: "the token is not accepted; log in with `hf auth login`, or set HF_TOKEN",
+        401: "it is private or not there, or the token is not accepted; log in with `hf auth login`, or set HF_TOKEN",
         403: "the token may not do that; make one that may write, and log in with `hf auth login`",
         409: "the repository is in the way of another one",
         412: "somebody else changed the repository meanwhile; run the same command again",
@@ -257,26 +265,46 @@ def resolve(text: str, kind: Kind, revision: str | None = None, token: str | boo
     from huggingface_hub import HfApi, constants
 
     repo, asked = parse_repo(text, revision)
-    commit: str = asked
+    commit: str | None = asked
     if not COMMIT.fullmatch(asked):
-        what = f"find {kind} {repo} at revision {asked} on {constants.ENDPOINT}"
-        api = HfApi(token=token)
-        try:
-            found = call(
-                what,
-                lambda: api.resolve_revision(repo, repo_type=kind, revision=asked, local_files_only=is_offline()),
-            )
-        except HubError as error:
-            if is_offline():
-                raise OfflineError(
-                    f"The network is switched off ({switched_off()}) and {repo} was never fetched at revision {asked}: "
-                    "unset it, or give a commit that was."
-                ) from error
-            raise
-        commit = str(found.resolved)
+        if is_offline():
+            commit = _remembered(repo, kind, asked)
+        else:
+            api = HfApi(token=token)
+            # not resolve_revision: when the Hub is busy, that gives an old commit without a word
+            what = f"find {kind} {repo} at revision {asked} on {constants.ENDPOINT}"
+            commit = call(what, lambda: api.repo_info(repo, repo_type=kind, revision=asked)).sha
+            commit = str(commit)
     if not COMMIT.fullmatch(commit):
         raise HubError(f"The Hub gave commit {commit[:60]!r} for {repo}, expected 40 hex digits: ask another endpoint.")
+    if commit != asked and not is_offline():
+        _remember(repo, kind, asked, commit)
     return Revision(repo, kind, commit, asked, constants.ENDPOINT, token)
+
+
+def _reference(repo: str, kind: Kind, asked: str) -> Path:
+    """Return the file in huggingface_hub's cache that tells which commit a branch was when it was last asked."""
+    from huggingface_hub import constants
+
+    return Path(constants.HF_HUB_CACHE, f"{kind}s--{repo.replace('/', '--')}", "refs", *asked.split("/"))
+
+
+def _remember(repo: str, kind: Kind, asked: str, commit: str) -> None:
+    path = _reference(repo, kind, asked)
+    with contextlib.suppress(OSError, NavrepDataError):  # a cache that cannot be written is no reason to stop
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write_bytes(path, commit.encode())
+
+
+def _remembered(repo: str, kind: Kind, asked: str) -> str:
+    try:
+        with open(_reference(repo, kind, asked), "rb") as file:
+            return file.read(100).decode("ascii", "replace").strip()
+    except OSError as error:
+        raise OfflineError(
+            f"The network is switched off ({switched_off()}) and {repo} was never fetched at revision {asked}: unset it "
+            "or give a commit that was."
+        ) from error
 
 
 def remote_files(at: Revision) -> dict[str, RemoteFile]:
@@ -337,6 +365,33 @@ def _meter(limit: int, show: bool | None) -> type[Any]:
             return bool(super().update(n))
 
     return Meter
+
+
+_chunks = threading.Lock()
+_chunk_users: list[int] = []
+
+
+@contextlib.contextmanager
+def _keep_what_arrives() -> Iterator[None]:
+    """Let huggingface_hub write down every byte as it arrives, so that it goes on from there when it is cut.
+
+    It collects 10 MiB before it writes, and loses them with the connection: over a line that is cut more often than
+    that it would never end.
+    """
+    from huggingface_hub import constants
+
+    with _chunks:
+        if not _chunk_users:
+            _chunk_users.append(constants.DOWNLOAD_CHUNK_SIZE)
+            constants.DOWNLOAD_CHUNK_SIZE = None  # type: ignore[assignment]  # what httpx takes for "as it arrives"
+        _chunk_users.append(0)
+    try:
+        yield
+    finally:
+        with _chunks:
+            _chunk_users.pop()
+            if len(_chunk_users) == 1:
+                constants.DOWNLOAD_CHUNK_SIZE = _chunk_users.pop()
 
 
 @contextlib.contextmanager
@@ -439,8 +494,8 @@ def _download(at: Revision, wanted: Sequence[FileEntry], folder: Path | None, pr
     meter = _meter(sum(entry.bytes for entry in wanted) + _SLACK, progress)
 
     def fetch() -> dict[str, Path]:
-        root = Path(
-            snapshot_download(
+        with _keep_what_arrives():
+            root = snapshot_download(
                 at.repo,
                 repo_type=at.kind,
                 revision=at.commit,
@@ -451,8 +506,7 @@ def _download(at: Revision, wanted: Sequence[FileEntry], folder: Path | None, pr
                 tqdm_class=meter,
                 local_files_only=is_offline(),
             )
-        )
-        paths = {entry.file: root.joinpath(*entry.file.split("/")) for entry in wanted}
+        paths = {entry.file: Path(root).joinpath(*entry.file.split("/")) for entry in wanted}
         missing = [name for name, path in paths.items() if not path.is_file()]
         if missing:  # huggingface_hub falls back to what is there when the Hub does not answer
             raise _AgainError(f"{missing[0]} did not come")

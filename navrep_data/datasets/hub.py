@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -377,23 +377,23 @@ class _Pull:
         return None
 
     def run(self, split: str | None, shards: Iterable[int] | None) -> PullResult:
+        begun = self.staging.exists()
         self.staging.mkdir(exist_ok=True)
         try:
             whole, there = fetch_manifest(self.at, self.staging)
             chosen = choose_shards(whole, split=split, shards=shards)
+            part = select_shards(whole, sorted({*chosen, *self._kept(whole)}))
+            wanted = _listed(part)
+            client.check_listed(self.at, there, wanted)
+            missing = [e for e in wanted if not client.is_right(safe_join(self.root, e.file), e)]
+            self._check_space(missing)
+            card = self._card(whole, there) if part is whole else dataset_card(part)
         except Exception:
-            if self.old is None and read_origin(self.staging) is None:
-                shutil.rmtree(self.staging, ignore_errors=True)  # nothing of worth has come yet
+            if not begun:  # nothing of worth has come yet
+                shutil.rmtree(self.staging, ignore_errors=True)
             raise
-        chosen = sorted({*chosen, *self._kept(whole)})
-        part = select_shards(whole, chosen)
-        card = self._card(whole) if part is whole else dataset_card(part)
-        wanted = _listed(part)
-        client.check_listed(self.at, there, wanted)
         origin = origin_of(self.at, whole)
         origin.save(self.staging)
-        missing = [e for e in wanted if not client.is_right(safe_join(self.root, e.file), e)]
-        self._check_space(missing)
         client.bring(self.at, missing, self.staging, done=self._put, progress=self.progress)
         origin.save(self.root)
         part.save(self.root, card)
@@ -423,16 +423,16 @@ class _Pull:
                 )
         return [at[s.file, s.sha256] for s in self.old.shards]
 
-    def _card(self, whole: Manifest) -> str:
+    def _card(self, whole: Manifest, there: Mapping[str, client.RemoteFile]) -> str:
         """Return the card whose hash the manifest gives: as this version writes it, else as the Hub has it."""
         card = dataset_card(whole)
         if sha256_bytes(card.encode()) == whole.card_sha256:
             return card
-        there = client.remote_files(self.at).get(CARD_FILE)
-        if there is None or there.bytes > _MAX_CARD_BYTES or whole.card_sha256 is None:
+        listed = there.get(CARD_FILE)
+        if listed is None or listed.bytes > _MAX_CARD_BYTES or whole.card_sha256 is None:
             raise CorruptDataError(f"{self.at} lacks the {CARD_FILE} that its manifest gives the hash of.")
         found: list[str] = []
-        entry = FileEntry(CARD_FILE, whole.card_sha256, there.bytes)
+        entry = FileEntry(CARD_FILE, whole.card_sha256, listed.bytes)
         client.bring(self.at, [entry], self.staging, done=lambda _, path: found.append(path.read_text("utf-8")))
         return found[0]
 

@@ -229,14 +229,14 @@ class _Handler(BaseHTTPRequestHandler):
         key = (asked.get("type", "model"), f"{asked['organization']}/{asked['name']}")
         if asked["organization"] != "user":
             raise _RefusedError(403, "", "You do not have the rights to create a repository there")
+        url = f"{self.hub.url}/{'datasets/' if key[0] == 'dataset' else ''}{key[1]}"
         with self.hub.lock:
             if key in self.hub.repos:
-                raise _RefusedError(409, "", "You already created this repository")
+                return self._send(409, json.dumps({"error": "it exists", "url": url}).encode())
             repo = Repo(private=asked.get("visibility") == "private")
             repo.commit("main", {".gitattributes": b"*.h5 filter=lfs\n"})
             self.hub.repos[key] = repo
-        prefix = "datasets/" if key[0] == "dataset" else ""
-        self._json({"url": f"{self.hub.url}/{prefix}{key[1]}"})
+        return self._json({"url": url})
 
     def _api(self, method: str, kind: str, name: str, verb: str | None, rest: str | None) -> None:
         repo = self._find(kind, name)
