@@ -33,7 +33,7 @@ def _quiet_client() -> None:
     """Leave it to our errors to tell what went wrong, in one line."""
     from huggingface_hub.utils import logging
 
-    logging.set_verbosity_error()
+    logging.set_verbosity_error()  # type: ignore[no-untyped-call]
 
 
 def push_command(

@@ -265,7 +265,7 @@ def resolve(text: str, kind: Kind, revision: str | None = None, token: str | boo
     from huggingface_hub import HfApi, constants
 
     repo, asked = parse_repo(text, revision)
-    commit: str | None = asked
+    commit = asked
     if not COMMIT.fullmatch(asked):
         if is_offline():
             commit = _remembered(repo, kind, asked)
@@ -273,8 +273,7 @@ def resolve(text: str, kind: Kind, revision: str | None = None, token: str | boo
             api = HfApi(token=token)
             # not resolve_revision: when the Hub is busy, that gives an old commit without a word
             what = f"find {kind} {repo} at revision {asked} on {constants.ENDPOINT}"
-            commit = call(what, lambda: api.repo_info(repo, repo_type=kind, revision=asked)).sha
-            commit = str(commit)
+            commit = str(call(what, lambda: api.repo_info(repo, repo_type=kind, revision=asked)).sha)
     if not COMMIT.fullmatch(commit):
         raise HubError(f"The Hub gave commit {commit[:60]!r} for {repo}, expected 40 hex digits: ask another endpoint.")
     if commit != asked and not is_offline():
@@ -302,7 +301,7 @@ def _remembered(repo: str, kind: Kind, asked: str) -> str:
             return file.read(100).decode("ascii", "replace").strip()
     except OSError as error:
         raise OfflineError(
-            f"The network is switched off ({switched_off()}) and {repo} was never fetched at revision {asked}: unset it "
+            f"The network is switched off ({switched_off()}) and {repo}@{asked} was never fetched: unset it "
             "or give a commit that was."
         ) from error
 
@@ -512,4 +511,14 @@ def _download(at: Revision, wanted: Sequence[FileEntry], folder: Path | None, pr
             raise _AgainError(f"{missing[0]} did not come")
         return paths
 
-    return call(f"get {len(wanted)} files of {at.kind} {at.repo}", fetch)
+    try:
+        return call(f"get {len(wanted)} files of {at.kind} {at.repo}", fetch)
+    except HubError as error:
+        if is_offline():
+            raise not_here(at) from error
+        raise
+
+
+def not_here(at: Revision) -> OfflineError:
+    """Return the error for what would have to come from the Hub while the network is off."""
+    return OfflineError(f"The network is switched off ({switched_off()}) and {at} is not whole in the cache: unset it.")

@@ -13,8 +13,8 @@ from navrep_data.datasets import _hub_client as client
 from navrep_data.datasets._hub_extras import INDEX_FILE, check_shard_index, read_index
 from navrep_data.datasets._hub_store import ShardStore
 from navrep_data.datasets.hub import fetch_manifest, origin_of, parse_manifest
-from navrep_data.errors import ConfigError, HubError, NavrepDataError, OfflineError
-from navrep_data.io import atomic_write_json, cache_dir, is_offline, read_json, switched_off
+from navrep_data.errors import ConfigError, NavrepDataError
+from navrep_data.io import atomic_write_json, cache_dir, is_offline, read_json
 from navrep_data.shards import (
     MANIFEST_FILE,
     DatasetFolder,
@@ -100,17 +100,9 @@ def open_whole(
 
     try:
         client.bring(at, wanted, None, done=done, checked=memo.is_right, progress=progress)
-    except HubError as error:
-        if is_offline():
-            raise _not_here(at) from error
-        raise
     finally:
         memo.save()
     return DatasetFolder(roots.pop(), manifest=part, origin=origin_of(at, manifest))
-
-
-def _not_here(at: client.Revision) -> OfflineError:
-    return OfflineError(f"The network is switched off ({switched_off()}) and {at} is not whole in the cache: unset it.")
 
 
 def _manifest(at: client.Revision) -> tuple[Manifest, dict[str, client.RemoteFile] | None]:
@@ -121,7 +113,7 @@ def _manifest(at: client.Revision) -> tuple[Manifest, dict[str, client.RemoteFil
 
     found = try_to_load_from_cache(at.repo, MANIFEST_FILE, revision=at.commit, repo_type="dataset")
     if not isinstance(found, str):
-        raise _not_here(at)
+        raise client.not_here(at)
     return parse_manifest(at, Path(found)), None
 
 
