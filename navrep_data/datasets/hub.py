@@ -181,18 +181,18 @@ def push(
     if problem := check_license(chosen):
         raise ConfigError(f"{problem[0].upper()}{problem[1:]}.")
     client.require_network(f"push {root} to {name}")
-    published, small = _published(root, manifest, chosen)
+    whole, small = published(root, chosen)
     files: dict[str, bytes | Path] = {
-        entry.file: safe_join(root, entry.file) for entry in _listed(published) if entry.file not in small
+        entry.file: safe_join(root, entry.file) for entry in _listed(whole) if entry.file not in small
     }
     commit = upload(
         name,
         "dataset",
         {**files, **small},
-        {entry.file: entry for entry in _listed(published)},
+        {entry.file: entry for entry in _listed(whole)},
         branch=branch,
         private=private,
-        message=message or f"{published.env}: {published.rows:,} steps",
+        message=message or f"{whole.env}: {whole.rows:,} steps",
         token=token,
         ours=_OURS,
     )
@@ -202,13 +202,14 @@ def push(
         commit=commit.commit,
         url=f"{commit.endpoint}/datasets/{name}",
         files=len(files) + len(small),
-        bytes=sum(entry.bytes for entry in _listed(published)),
-        content_hash=content_hash(published),
+        bytes=sum(entry.bytes for entry in _listed(whole)),
+        content_hash=content_hash(whole),
     )
 
 
-def _published(root: Path, manifest: Manifest, license: str) -> tuple[Manifest, dict[str, bytes]]:
-    """Return the manifest of the published dataset, and the files that are made for it."""
+def published(root: Path, license: str) -> tuple[Manifest, dict[str, bytes]]:
+    """Return what the dataset in `root` is once published: its manifest, and the files that a push adds, by name."""
+    manifest = Manifest.read(root)
     small: dict[str, bytes] = {}
     if not (manifest.extras and all(client.is_right(safe_join(root, e.file), e) for e in manifest.extras)):
         small = make_extras(root)

@@ -322,7 +322,9 @@ def test_a_file_that_stays_wrong_never_counts(hub, pushed, template, tmp_path):
 
 
 @pytest.mark.parametrize("path", [r"/api/datasets", r"/tree/", r"/resolve/", LARGE, "manifest.json"])
-@pytest.mark.parametrize("status", [429, 500, 503])
+@pytest.mark.parametrize(
+    "status", [429, pytest.param(500, marks=pytest.mark.slow), pytest.param(503, marks=pytest.mark.slow)]
+)
 def test_busy_servers_are_asked_again(hub, pushed, template, tmp_path, quick, path, status):
     hub.faults = [Fault("status", path, times=2, status=status, headers={"Retry-After": "7"})]
     check_whole(pull(REPO, tmp_path / "got").root, template)
@@ -590,6 +592,7 @@ def command(hub, tmp_path):
     return start
 
 
+@pytest.mark.slow
 def test_cli(command, hub, template, tmp_path):
     code, out, err = command("push", template, REPO)
     assert (code, out) == (2, "")
