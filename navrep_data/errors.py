@@ -98,6 +98,10 @@ class OfflineError(DownloadError):
     """A file is not on this machine and the network is switched off."""
 
 
+class HubError(NavrepDataError, OSError):
+    """The Hub refuses, cannot be reached, or does not have what was asked for."""
+
+
 class ModelNotFoundError(NavrepDataError, FileNotFoundError):
     """A checkpoint's file is neither in the given folder nor in the cache, and no network was asked or has it."""
 

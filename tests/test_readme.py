@@ -24,9 +24,26 @@ def test_there_are_blocks_of_both_kinds():
     assert kinds.count("bash") >= 3
 
 
+@pytest.fixture
+def hub():
+    """The Hub that the README's commands talk to: ours, on the loopback (see tests/hub/hub_server.py)."""
+    sys.path.insert(0, str(README.parent / "tests" / "hub"))
+    try:
+        import hub_server
+    finally:
+        sys.path.pop(0)
+    with hub_server.serving() as running:
+        yield {"HF_ENDPOINT": running.url, "HF_TOKEN": hub_server.TOKEN, "HF_HUB_DISABLE_XET": "1"}
+
+
 @pytest.mark.slow
-def test_code_blocks_run(tmp_path):
+def test_code_blocks_run(tmp_path, hub):
     env = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    env |= {
+        **hub,
+        "HF_HOME": str(tmp_path / "hf"),
+        "NAVREP_DATA_HOME": env.get("NAVREP_DATA_HOME", str(tmp_path / "home")),
+    }
     shared = README.parent.parent / "shared" / "released"
     if shared.is_dir():
         env["NAVREP_RELEASED_DIR"] = str(shared)

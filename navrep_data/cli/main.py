@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from navrep_data._version import __version__
-from navrep_data.cli import benchmark, generate, import_npz, info, models, play, verify
+from navrep_data.cli import benchmark, generate, hub, import_npz, info, models, play, verify
 from navrep_data.errors import NavrepDataError, did_you_mean
 
 app = typer.Typer(
@@ -26,6 +26,9 @@ app.command("info")(info.info_command)
 app.command("verify")(verify.verify_command)
 app.command("import-npz")(import_npz.import_npz_command)
 app.command("play")(play.play_command)
+app.command("push")(hub.push_command)
+app.command("pull")(hub.pull_command)
+app.command("push-model")(hub.push_model_command)
 app.add_typer(models.models_app, name="models")
 
 # Newer typers carry their own click; these are the classes that the installed one raises, whichever that is.

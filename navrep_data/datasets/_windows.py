@@ -36,6 +36,11 @@ def check_rows(name: str, value: Any) -> int:
     return int(value)
 
 
+def open_folder(root: str | os.PathLike[str] | DatasetFolder) -> DatasetFolder:
+    """Return `root` opened, itself if it is open already."""
+    return root if isinstance(root, DatasetFolder) else DatasetFolder(Path(root))
+
+
 def make_spec(
     folder: DatasetFolder,
     *,
@@ -91,14 +96,13 @@ class WindowDataset(Dataset[Batch]):
 
     def __init__(
         self,
-        root: str | os.PathLike[str],
         folder: DatasetFolder,
         episodes: Episodes,
         table: WindowTable,
         spec: BatchSpec,
         preload: bool,
     ) -> None:
-        self.root = Path(root)
+        self.root = folder.root
         self.spec = spec
         self.table = table
         self.preload = preload
@@ -201,6 +205,11 @@ class WindowDataset(Dataset[Batch]):
         }
         return {name: int(values[index]) for name, values in names.items()}
 
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What a checkpoint records of the dataset it was trained on, see :func:`navrep_data.shards.dataset_record`."""
+        return self._folder.provenance
+
     def close(self) -> None:
         """Close the open files; the next access opens them again."""
         self._folder.close()
@@ -216,5 +225,6 @@ __all__ = [
     "WindowDataset",
     "cut",
     "make_spec",
+    "open_folder",
     "select_episodes",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from pathlib import Path
+from typing import Any, Self
 
 from navrep_data.datasets._windows import (
     Batch,
@@ -16,6 +16,7 @@ from navrep_data.datasets._windows import (
     WindowDataset,
     cut,
     make_spec,
+    open_folder,
     select_episodes,
 )
 
@@ -25,7 +26,7 @@ class ScanDataset(WindowDataset):
 
     Parameters
     ----------
-    root : path-like
+    root : path-like or DatasetFolder
         Dataset folder.
     lidar : {"rings", "1d"}
         ``rings``: field `rings`, (64, 64) float32, 0 free, 0.5 unknown, 1 occupied. ``1d``: field `scan`,
@@ -53,7 +54,7 @@ class ScanDataset(WindowDataset):
 
     def __init__(
         self,
-        root: str | os.PathLike[str],
+        root: str | os.PathLike[str] | DatasetFolder,
         lidar: Lidar = "rings",
         *,
         split: Split | None = None,
@@ -62,7 +63,7 @@ class ScanDataset(WindowDataset):
         invalid: Invalid = "zero",
         preload: bool = False,
     ) -> None:
-        folder = DatasetFolder(Path(root))
+        folder = open_folder(root)
         spec = make_spec(
             folder,
             window=1,
@@ -76,7 +77,43 @@ class ScanDataset(WindowDataset):
             invalid=invalid,
         )
         episodes = select_episodes(folder, split)
-        super().__init__(root, folder, episodes, cut(episodes, 1, 1, across=False), spec, preload)
+        super().__init__(folder, episodes, cut(episodes, 1, 1, across=False), spec, preload)
+
+    @classmethod
+    def from_hub(
+        cls,
+        repo: str,
+        lidar: Lidar = "rings",
+        *,
+        revision: str | None = None,
+        token: str | bool | None = None,
+        **options: Any,
+    ) -> Self:
+        """Open a dataset of the Hugging Face Hub, brought into huggingface_hub's cache whole and checked.
+
+        Parameters
+        ----------
+        repo : str
+            ``user/name``.
+        lidar : {"rings", "1d"}
+            As for the class.
+        revision : str, optional
+            Branch, tag or commit; ``main`` by default. Give a commit and the data never change.
+        token : str or bool, optional
+            As huggingface_hub takes it; by default the one that is logged in.
+        **options
+            As for the class. Only shards that hold something of `split` are brought.
+
+        Raises
+        ------
+        DatasetNotFoundError, CorruptDataError, HubError, OfflineError
+            If there is no such dataset, a file does not have its SHA-256, or it cannot be had. Offline, a dataset that
+            is in the cache opens.
+        """
+        from navrep_data.datasets._hub_open import open_whole
+
+        folder = open_whole(repo, revision=revision, split=options.get("split"), token=token)
+        return cls(folder, lidar, **options)
 
     def _finish(self, batch: Batch) -> Batch:
         return {name: value[:, 0] for name, value in batch.items() if name != "mask"}

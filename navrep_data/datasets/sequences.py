@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Self
 
 from navrep_data.datasets._batch import STEP_FIELDS
 from navrep_data.datasets._windows import (
@@ -18,6 +17,7 @@ from navrep_data.datasets._windows import (
     check_rows,
     cut,
     make_spec,
+    open_folder,
     select_episodes,
 )
 
@@ -27,7 +27,7 @@ class SequenceDataset(WindowDataset):
 
     Parameters
     ----------
-    root : path-like
+    root : path-like or DatasetFolder
         Dataset folder, as written by ``navrep-data generate`` or :func:`import_npz`.
     lidar : {"rings", "1d"} or None
         ``rings``: field `rings`, (W, 64, 64) float32, 0 free, 0.5 unknown, 1 occupied, computed from the
@@ -109,7 +109,7 @@ class SequenceDataset(WindowDataset):
 
     def __init__(
         self,
-        root: str | os.PathLike[str],
+        root: str | os.PathLike[str] | DatasetFolder,
         lidar: Lidar | None = "rings",
         *,
         window: int = 32,
@@ -125,7 +125,7 @@ class SequenceDataset(WindowDataset):
     ) -> None:
         window = check_rows("window", window)
         stride = window if stride is None else check_rows("stride", stride)
-        folder = DatasetFolder(Path(root))
+        folder = open_folder(root)
         spec = make_spec(
             folder,
             window=window,
@@ -139,4 +139,40 @@ class SequenceDataset(WindowDataset):
             invalid=invalid,
         )
         episodes = select_episodes(folder, split)
-        super().__init__(root, folder, episodes, cut(episodes, window, stride, across_episodes), spec, preload)
+        super().__init__(folder, episodes, cut(episodes, window, stride, across_episodes), spec, preload)
+
+    @classmethod
+    def from_hub(
+        cls,
+        repo: str,
+        lidar: Lidar | None = "rings",
+        *,
+        revision: str | None = None,
+        token: str | bool | None = None,
+        **options: Any,
+    ) -> Self:
+        """Open a dataset of the Hugging Face Hub, brought into huggingface_hub's cache whole and checked.
+
+        Parameters
+        ----------
+        repo : str
+            ``user/name``.
+        lidar : {"rings", "1d"} or None
+            As for the class.
+        revision : str, optional
+            Branch, tag or commit; ``main`` by default. Give a commit and the data never change.
+        token : str or bool, optional
+            As huggingface_hub takes it; by default the one that is logged in.
+        **options
+            As for the class. Only shards that hold something of `split` are brought.
+
+        Raises
+        ------
+        DatasetNotFoundError, CorruptDataError, HubError, OfflineError
+            If there is no such dataset, a file does not have its SHA-256, or it cannot be had. Offline, a dataset that
+            is in the cache opens.
+        """
+        from navrep_data.datasets._hub_open import open_whole
+
+        folder = open_whole(repo, revision=revision, split=options.get("split"), token=token)
+        return cls(folder, lidar, **options)

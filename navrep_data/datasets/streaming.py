@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
@@ -27,6 +26,7 @@ from navrep_data.datasets._windows import (
     check_rows,
     cut,
     make_spec,
+    open_folder,
 )
 from navrep_data.errors import ConfigError
 
@@ -104,7 +104,7 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
 
     def __init__(
         self,
-        root: str | os.PathLike[str],
+        root: str | os.PathLike[str] | DatasetFolder,
         lidar: Lidar | None = "rings",
         *,
         window: int = 32,
@@ -130,7 +130,7 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         self.shuffle = bool(shuffle)
         self.seed = int(seed)
         self.rank, self.world_size = _rank_and_world(rank, world_size)
-        self._folder = DatasetFolder(Path(root))
+        self._folder = open_folder(root)
         self.spec = make_spec(
             self._folder,
             window=window,
@@ -156,6 +156,57 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         self._position = 0
         self._worker = (0, 1)
 
+    @classmethod
+    def from_hub(
+        cls,
+        repo: str,
+        lidar: Lidar | None = "rings",
+        *,
+        revision: str | None = None,
+        token: str | bool | None = None,
+        cache_bytes: int = 8 << 30,
+        prefetch: int = 2,
+        **options: Any,
+    ) -> Self:
+        """Stream a dataset straight from the Hugging Face Hub: only the shards that are read come, each checked.
+
+        Parameters
+        ----------
+        repo : str
+            ``user/name``.
+        lidar : {"rings", "1d"} or None
+            As for the class.
+        revision : str, optional
+            Branch, tag or commit; ``main`` by default.
+        token : str or bool, optional
+            As huggingface_hub takes it; by default the one that is logged in.
+        cache_bytes : int
+            Bound on the disk space of the shards kept (in ``NAVREP_DATA_HOME`` or the user's cache folder), shared by
+            all processes; those used longest ago go first.
+        prefetch : int
+            Shards fetched ahead of the one that is read, per process, as the cache allows.
+        **options
+            As for the class.
+
+        Raises
+        ------
+        ConfigError
+            If the cache cannot hold the shards of ``buffer_sequences`` sequences.
+        DatasetNotFoundError, CorruptDataError, HubError, OfflineError
+            If there is no such dataset, a file does not have its SHA-256, or it cannot be had.
+
+        Notes
+        -----
+        Opening reads the manifest and the index of episodes that ``navrep-data push`` adds, no shard. A dataset that
+        came to the Hub in another way has no index: then every shard comes once before the first window.
+        """
+        from navrep_data.datasets._hub_open import check_room, open_stream
+
+        folder = open_stream(repo, revision=revision, token=token, cache_bytes=cache_bytes, ahead=prefetch)
+        dataset = cls(folder, lidar, **options)
+        check_room(folder, dataset.buffer_sequences, folder.manifest.shards)
+        return dataset
+
     @property
     def epoch(self) -> int:
         """The epoch whose order is used."""
@@ -173,6 +224,11 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         """Number of windows that this rank gets per epoch."""
         first, stop = _share(0, len(self.table), self.rank, self.world_size)
         return stop - first
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What a checkpoint records of the dataset it was trained on, see :func:`navrep_data.shards.dataset_record`."""
+        return self._folder.provenance
 
     def close(self) -> None:
         """Close the open files; the next access opens them again."""
@@ -204,6 +260,7 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
             return
         mine = np.arange(np.searchsorted(ends, first, side="right"), np.searchsorted(ends, stop, side="left") + 1)
         mine = mine[sizes[mine] > 0]
+        self._folder.expect(self._sequences.shard[order[mine]])
         for number, k in enumerate(range(0, len(mine), self.buffer_sequences)):
             block = mine[k : k + self.buffer_sequences]
             windows = []
@@ -236,7 +293,10 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
             skip = resume["positions"][worker]
         self._worker = (worker, workers)
         self._position = skip
-        yield from self._hand_out(self._batches(epoch, worker, workers, skip))
+        try:
+            yield from self._hand_out(self._batches(epoch, worker, workers, skip))
+        finally:
+            self._folder.expect(())
         self._resume = None
         self._position = 0
 

@@ -13,7 +13,7 @@ from navrep_data.io._files import (
     sha256_file,
     translate_os_error,
 )
-from navrep_data.io.download import FileId, download, git_blob_sha1, is_offline
+from navrep_data.io.download import FileId, download, git_blob_sha1, is_offline, switched_off
 
 __all__ = [
     "PART_SUFFIX",
@@ -30,5 +30,6 @@ __all__ = [
     "safe_join",
     "sha256_bytes",
     "sha256_file",
+    "switched_off",
     "translate_os_error",
 ]

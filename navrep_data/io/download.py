@@ -94,7 +94,7 @@ def git_blob_sha1(path: Path | str) -> str:
     return digest.hexdigest()
 
 
-def _switched_off() -> str:
+def switched_off() -> str:
     """Return the variable that switches the network off, as NAME=value; empty if none does."""
     for name in OFFLINE_VARIABLES:
         value = os.environ.get(name, "").strip()
@@ -105,7 +105,7 @@ def _switched_off() -> str:
 
 def is_offline() -> bool:
     """Return whether ``NAVREP_DATA_OFFLINE`` or ``HF_HUB_OFFLINE`` switches the network off."""
-    return bool(_switched_off())
+    return bool(switched_off())
 
 
 class _TryAgainError(Exception):
@@ -184,7 +184,7 @@ def download(
     target = Path(target)
     if is_offline():
         raise OfflineError(
-            f"The network is switched off ({_switched_off()}), cannot get {url}: bring the file or unset it."
+            f"The network is switched off ({switched_off()}), cannot get {url}: bring the file or unset it."
         )
     import filelock
 

@@ -11,12 +11,34 @@ import os
 from typing import Any
 
 from navrep_data.zoo import fetching as _fetching
+from navrep_data.zoo import folders as _folders
 from navrep_data.zoo import registry as _registry
 from navrep_data.zoo.fetching import fetch
+from navrep_data.zoo.folders import save_policy
 from navrep_data.zoo.registry import Record, list_models
 from navrep_data.zoo.verification import Check, Report, verify
 
-__all__ = ["Check", "Record", "Report", "fetch", "list_models", "load", "load_sb3", "show", "verify"]
+__all__ = [
+    "Check",
+    "Record",
+    "Report",
+    "fetch",
+    "list_models",
+    "load",
+    "load_sb3",
+    "push_model",
+    "save_policy",
+    "show",
+    "verify",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "push_model":  # needs torch
+        from navrep_data.zoo.hub import push_model
+
+        return push_model
+    raise AttributeError(f"module 'navrep_data.zoo' has no attribute {name!r}")
 
 
 def show(name: str) -> Record:
@@ -36,7 +58,7 @@ def show(name: str) -> Record:
 
 
 def load(
-    name: str,
+    name: str | os.PathLike[str],
     source: str | os.PathLike[str] | None = None,
     inference: str = "deterministic",
     seed: int = 0,
@@ -46,8 +68,10 @@ def load(
 
     Parameters
     ----------
-    name : str
-        Full name such as ``transformer_1d_z.released``, or a variant (then a line on stderr says whose weights it is).
+    name : str or path-like
+        Full name such as ``transformer_1d_z.released``, or a variant (then a line on stderr says whose weights it is);
+        ``hf://user/name`` or ``hf://user/name@revision``, put there by ``navrep-data push-model``; or a place on this
+        machine: ``./folder`` with a checkpoint or a policy (:func:`save_policy`), ``FILE.safetensors``, a path object.
     source : path-like or str, optional
         Folder, ``https://...`` or ``hf://user/name`` to look in before the cache and the authors' repository.
         Default: ``NAVREP_RELEASED_DIR`` where it is set.
@@ -68,9 +92,18 @@ def load(
     ------
     UnknownNameError
         If there is no such name, or it fits several runs.
-    CorruptDataError, OfflineError, DownloadError
+    CorruptDataError, OfflineError, DownloadError, HubError
         If a file is not what it must be, or cannot be had.
+    ModelNotFoundError, CheckpointError
+        If there is no model in the folder or repository, or it is not one of this package.
     """
+    if isinstance(name, str) and name.startswith(_fetching.HUB_SCHEME):
+        from navrep_data.zoo.hub import fetch_model
+
+        name = fetch_model(name)
+    if _folders.is_path(name):
+        return _folders.load_folder(name, inference=inference, seed=seed, **options)
+    name = os.fspath(name)
     record = _registry.resolve(name)
     where = _fetching.Source.of(source)
     # all files first: a part that cannot be had is told before seconds are spent on torch

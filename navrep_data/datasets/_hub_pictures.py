@@ -1,0 +1,158 @@
+"""A picture and a moving one of a dataset, drawn from its own rows, for its card."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from navrep_data.observations import metres_from_millimetres, scan_to_rings
+from navrep_data.schema import Event
+from navrep_data.shards import DatasetFolder, EpisodeWorld
+from navrep_data.sim.drawing import draw_rings, draw_scan, draw_world
+
+FRAMES = 48
+SECONDS_PER_FRAME = 0.12
+COLOURS = 128
+_SHARE = 0.35  # how far into the episode the still picture is
+_EPISODES_LOOKED_AT = 2000
+_MARGIN = 1.0
+# What must be stored to draw a world.
+_NEEDED = ("scan", "humans", "robot_pose", "robot_radius")
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class _Episode:
+    """The rows of one episode, and what stood around."""
+
+    rows: dict[str, Array]
+    world: EpisodeWorld
+    folder: DatasetFolder
+
+    def __len__(self) -> int:
+        return len(self.rows["scan"])
+
+    def draw_world(self, axes: Any, row: int) -> None:
+        border = self.world.border
+        pose = self.rows["robot_pose"][row]
+        draw_world(
+            axes,
+            [*self.world.polygons, *([border] if border is not None else [])],
+            pose,
+            radius=float(self.rows["robot_radius"][row]),
+            goal=self.world.robot_goal,
+            humans=_to_world(self.rows["humans"][row], pose),
+            scan=self.metres(row),
+            sensor=self.folder.manifest.sensor,
+            trail=self.rows["robot_pose"][: row + 1, :2],
+        )
+
+    def metres(self, row: int) -> Array:
+        scan = self.rows["scan"][row]
+        return metres_from_millimetres(scan) if scan.dtype == np.uint16 else scan
+
+    def rings(self, row: int) -> Array:
+        return scan_to_rings(self.rows["scan"][row])
+
+
+def draw_pictures(folder: DatasetFolder) -> dict[str, bytes]:
+    """Return a PNG and a GIF by name; none where a dataset does not hold what is needed to draw its worlds."""
+    episode = _choose(folder)
+    if episode is None:
+        return {}
+    name = "".join(c if c.isalnum() else "-" for c in folder.manifest.env)[:80]
+    return {f"media/{name}-episode.gif": _moving(episode), f"media/{name}-scene.png": _still(episode)}
+
+
+def _choose(folder: DatasetFolder) -> _Episode | None:
+    """Return the longest of the first episodes that reached its goal, or of all if none did."""
+    if not set(_NEEDED) <= set(folder.manifest.columns) or folder.manifest.sensor.n_rays < 2:
+        return None
+    e = folder.episodes
+    looked = np.arange(min(len(e), _EPISODES_LOOKED_AT))
+    reached = looked[e.event[looked] == Event.GOAL]
+    candidates = reached if len(reached) else looked
+    if not len(candidates):
+        return None
+    k = int(candidates[np.argmax(e.length[candidates])])
+    shard, start, stop = int(e.shard[k]), int(e.start[k]), int(e.start[k] + e.length[k])
+    worlds = folder.worlds(shard)
+    if worlds is None:
+        return None
+    rows = {column: folder.read(column, shard, start, stop) for column in _NEEDED}
+    if not np.isfinite(rows["robot_pose"]).all():  # imports do not know it
+        return None
+    return _Episode(rows, worlds.episode(int(np.flatnonzero(worlds.arrays["row"] == start)[0])), folder)
+
+
+def _to_world(humans: Array, pose: Array) -> Array:
+    """Turn one row of the humans column to the world frame."""
+    c, s = np.cos(float(pose[2])), np.sin(float(pose[2]))
+    turn = np.array([[c, -s], [s, c]])
+    turned = humans.astype(np.float64)
+    turned[:, :2] = humans[:, :2] @ turn.T + pose[:2]
+    turned[:, 2:4] = humans[:, 2:4] @ turn.T
+    return turned
+
+
+def _figure(width: float, height: float, mosaic: str, dpi: int, ratios: tuple[float, float]) -> tuple[Any, Any]:
+    # not pyplot: it would choose a backend for the whole process
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplot_mosaic(mosaic, width_ratios=list(ratios))
+
+
+def _still(episode: _Episode) -> bytes:
+    row = int(_SHARE * (len(episode) - 1))
+    figure, axes = _figure(11, 6, "WS;WR", 100, (1.15, 1.0))
+    episode.draw_world(axes["W"], row)
+    axes["W"].set_title("world: robot (red), humans (pale: not in sight), goal (star)", fontsize=10)
+    draw_scan(axes["S"], episode.metres(row), episode.folder.manifest.sensor)
+    axes["S"].set_title(f"scan: {episode.folder.manifest.sensor.n_rays} ranges", fontsize=10)
+    draw_rings(axes["R"], episode.rings(row))
+    axes["R"].set_title("rings: 64 x 64, white free, grey unknown, dark occupied", fontsize=10)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def _frames(episode: _Episode) -> Iterator[Any]:
+    from PIL import Image
+
+    figure, axes = _figure(6.4, 3.2, "WR", 80, (1.0, 1.0))
+    points = np.concatenate([np.asarray(p) for p in (*episode.world.polygons, episode.rows["robot_pose"][:, :2])])
+    if episode.world.border is not None:
+        points = episode.world.border
+    low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
+    for row in np.unique(np.linspace(0, len(episode) - 1, FRAMES).astype(int)):
+        for one in axes.values():
+            one.clear()
+        episode.draw_world(axes["W"], int(row))
+        axes["W"].set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        draw_rings(axes["R"], episode.rings(int(row)))
+        for one in axes.values():
+            one.set(xticks=[], yticks=[], xlabel="", ylabel="")
+        figure.canvas.draw()
+        yield Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
+
+
+def _moving(episode: _Episode) -> bytes:
+    from PIL import Image
+
+    frames = list(_frames(episode))
+    # one palette for all frames, so that still parts stay equal and cost nothing
+    palette = frames[len(frames) // 2].quantize(COLOURS, dither=Image.Dither.NONE)
+    flat = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    buffer = io.BytesIO()
+    pause = int(1000 * SECONDS_PER_FRAME)
+    flat[0].save(buffer, "GIF", save_all=True, append_images=flat[1:], duration=pause, loop=0, optimize=True)
+    return buffer.getvalue()

@@ -1,0 +1,191 @@
+"""Dataset cards: current, true to what the package generates, and readable by the Hub."""
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from navrep_data.datasets import cards
+from navrep_data.datasets._hub_pictures import draw_pictures
+from navrep_data.errors import ConfigError
+from navrep_data.io import json_bytes, sha256_file
+from navrep_data.shards import DatasetFolder, Manifest, dataset_card
+from navrep_data.testing import tiny_dataset
+
+FOLDER = Path(__file__).resolve().parents[2] / "cards" / "datasets"
+ENVS = sorted(cards.PUBLISHED)
+MAX_GIF_BYTES = 1_500_000
+AGAIN = "run: python -m navrep_data.datasets.cards cards/datasets"
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    return tiny_dataset(tmp_path_factory.mktemp("cards") / "tiny", n=4, length=60)
+
+
+def test_cards_are_current():
+    committed = {path.stem: path.read_text() for path in FOLDER.glob("*.md")}
+    assert set(committed) == set(ENVS) == {path.stem for path in FOLDER.glob("*.json")}, AGAIN
+    for env in ENVS:
+        manifest = cards.read_published(FOLDER, env)
+        assert committed[env] == dataset_card(manifest), AGAIN
+        assert (FOLDER / f"{env}.json").read_bytes() == json_bytes(manifest.to_dict())
+        assert (manifest.env, manifest.license, manifest.complete) == (env, cards.PUBLISHED[env], True)
+
+
+def test_pictures_are_those_of_the_manifests():
+    listed = {}
+    for env in ENVS:
+        extras = cards.read_published(FOLDER, env).extras
+        listed |= {e.file: e.sha256 for e in extras if e.file.startswith("media/")}
+    there = {f"media/{path.name}": sha256_file(path) for path in (FOLDER / "media").iterdir()}
+    assert there == listed
+    for path in (FOLDER / "media").glob("*.gif"):
+        assert path.stat().st_size < MAX_GIF_BYTES
+
+
+@pytest.mark.parametrize("env", ENVS)
+def test_card(env):
+    manifest = cards.read_published(FOLDER, env)
+    _, front, body = (FOLDER / f"{env}.md").read_text().split("---\n", 2)
+    head = yaml.safe_load(front)
+    assert head["license"] == cards.PUBLISHED[env]
+    assert set(head["task_categories"]) <= {"reinforcement-learning", "robotics"}
+    assert head["size_categories"] == ["1M<n<10M"]
+    assert {"navrep", "lidar"} <= set(head["tags"])
+    assert head["configs"] == [
+        {"config_name": "default", "data_files": [{"split": "train", "path": "data/*.h5"}]}
+    ]  # each shard holds sequences of all splits
+    for title in ("How it was made", "Columns", "Outcomes", "Splits", "Statistics", "How to load it", "Known limits"):
+        assert f"\n## {title}\n" in body
+    for event, outcome in manifest.statistics["outcomes"].items():
+        if outcome["episodes"]:
+            assert f"| {event} | {outcome['episodes']:,} | {100 * outcome['share']:.1f} %" in body
+    for extra in manifest.extras:
+        if extra.file.startswith("media/"):
+            assert f"]({extra.file})" in body
+    assert "not made or endorsed by the NavRep authors" in body
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env", ENVS)
+def test_the_package_generates_what_the_card_describes(env, tmp_path):
+    """The first sequences of the published dataset, made again: a sequence depends on seed and number alone."""
+    import shlex
+
+    from navrep_data.cli import main as cli
+
+    manifest = cards.read_published(FOLDER, env)
+    words = shlex.split(manifest.command)
+    assert words[:2] == ["navrep-data", "generate"]
+    words[words.index("--n") + 1] = "2"
+    with pytest.raises(SystemExit) as done:
+        cli.run([*words[1:], "--out", str(tmp_path), "--workers", "1"])
+    assert done.value.code == 0
+    again = Manifest.read(tmp_path)
+    if again.versions != manifest.versions:
+        pytest.skip("other versions or another CPU: bytes are promised for those of the manifest")
+    assert again.shards[0].sequence_hashes == manifest.shards[0].sequence_hashes[:2]
+
+
+@pytest.mark.slow
+def test_add_takes_over_a_dataset(simulated, tmp_path, monkeypatch):
+    cards.add(tmp_path, simulated)
+    assert cards.write_cards(tmp_path) == [tmp_path / "soadrl.md"]
+    assert "license: mit" in (tmp_path / "soadrl.md").read_text()
+    assert sorted(p.name for p in (tmp_path / "media").iterdir()) == ["soadrl-episode.gif", "soadrl-scene.png"]
+    monkeypatch.setattr(cards, "PUBLISHED", {})
+    with pytest.raises(ConfigError, match="a dataset of soadrl, which is not in PUBLISHED: add its line"):
+        cards.add(tmp_path, simulated)
+
+
+# ---- pictures ----
+
+
+@pytest.mark.slow
+def test_pictures_are_drawn_from_the_data(simulated):
+    with DatasetFolder(simulated) as folder:
+        made = draw_pictures(folder)
+    gif, png = (Image.open(io.BytesIO(made[f"media/soadrl-{name}"])) for name in ("episode.gif", "scene.png"))
+    assert len(made["media/soadrl-episode.gif"]) < MAX_GIF_BYTES
+    assert png.size == (1100, 600)
+    assert 10 <= gif.n_frames <= 48
+    assert gif.info["loop"] == 0
+    first = np.asarray(gif.convert("RGB"))
+    gif.seek(gif.n_frames - 1)
+    last = np.asarray(gif.convert("RGB"))
+    assert (first != last).any(axis=2).mean() > 0.01  # it moves
+    for colour in ((209, 73, 91), (46, 134, 171)):  # the robot's red, somebody's blue
+        distance = np.abs(np.asarray(png.convert("RGB")).astype(int) - colour).sum(axis=2)
+        assert (distance < 30).any()
+
+
+def test_no_pictures_without_worlds_or_humans(simulated, monkeypatch):
+    with DatasetFolder(simulated) as folder:
+        folder.manifest = replace(
+            folder.manifest, shards=tuple(replace(s, worlds=None) for s in folder.manifest.shards)
+        )
+        assert draw_pictures(folder) == {}
+        folder.manifest = replace(folder.manifest, columns=tuple(c for c in folder.manifest.columns if c != "humans"))
+        assert draw_pictures(folder) == {}
+
+
+# ---- the Hub's viewer ----
+
+
+@pytest.fixture
+def loader(monkeypatch, tmp_path):
+    """``datasets.load_dataset``, which the Hub's viewer runs on; it must not ask the network."""
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
+    datasets = pytest.importorskip("datasets")
+    return lambda *a, **k: datasets.load_dataset(*a, cache_dir=str(tmp_path / "cache"), **k)
+
+
+def check_rows(table, shards):
+    at = 0
+    for path in shards:
+        with h5py.File(path) as shard:
+            rows = len(shard["reward"])
+            part = table.with_format("numpy")[at : at + rows]
+            for name, column in shard.items():
+                stored = column[:]
+                if stored.dtype == np.float64:  # the numpy format of datasets gives float32
+                    stored = stored.astype(np.float32)
+                assert part[name].dtype.kind == stored.dtype.kind or part[name].dtype == np.int64
+                assert np.array_equal(part[name], stored, equal_nan=stored.dtype.kind == "f"), name
+            at += rows
+    assert at == len(table)
+
+
+@pytest.mark.slow
+def test_load_dataset_opens_the_shards(loader, template):
+    shards = sorted((template / "data").glob("*.h5"))
+    table = loader("hdf5", data_files=[str(path) for path in shards], split="train")
+    with h5py.File(shards[0]) as shard:
+        assert set(table.column_names) == set(shard)
+    check_rows(table, shards)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shard_size", [1, 2])
+def test_load_dataset_understands_the_card(loader, tmp_path, shard_size):
+    """What the viewer does: the front matter of README.md says which files are which split."""
+    from shards.synthetic import make_dataset
+
+    root = tmp_path / "set"
+    manifest = make_dataset(root, 4, shard_size, 20)
+    tables = loader(str(root))
+    if shard_size == 2:
+        assert set(tables) == {"train"}
+        return check_rows(tables["train"], sorted((root / "data").glob("*.h5")))
+    assert set(tables) == {"train", "val", "test"}
+    for name, table in tables.items():
+        mine = [root / s.file for s in manifest.shards if manifest.split_of(s.sequences[0]) == name]
+        check_rows(table, mine)
+    return None
