@@ -36,6 +36,8 @@ class ModelConfig:
                 raise ConfigError(
                     f"{field.name} of a {self.kind} is {str(value)[:40]}, expected a whole number from 1 to {limit}."
                 )
+            if field.type == "bool" and type(value) is not bool:
+                raise ConfigError(f"{field.name} of a {self.kind} is {str(value)[:40]!r}, expected true or false.")
         for name, allowed in (("lidar", LIDARS), ("action_alignment", ACTION_ALIGNMENTS)):
             value = getattr(self, name, allowed[0])
             if value not in allowed:
@@ -138,6 +140,8 @@ class JointConfig(ModelConfig):
         LSTM layers.
     action_alignment : str
         As for :class:`MemoryConfig`.
+    residual : bool
+        Predict the change of z and goal instead of their next values; the released models do not.
     """
 
     kind: ClassVar[str] = "joint"
@@ -146,6 +150,7 @@ class JointConfig(ModelConfig):
     h_size: int = 64
     n_layers: int = 2
     action_alignment: str = "leading"
+    residual: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -167,6 +172,8 @@ class TransformerConfig(ModelConfig):
         Longest sequence (learned positions).
     action_alignment : str
         As for :class:`MemoryConfig`.
+    residual : bool
+        As for :class:`JointConfig`.
     """
 
     kind: ClassVar[str] = "transformer"
@@ -176,6 +183,7 @@ class TransformerConfig(ModelConfig):
     n_heads: int = 8
     context: int = 32
     action_alignment: str = "leading"
+    residual: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

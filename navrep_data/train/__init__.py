@@ -1,0 +1,16 @@
+"""Training of V, M, joint model, transformer and controllers: plain PyTorch on the package's datasets."""
+
+from __future__ import annotations
+
+from navrep_data.train.recipe import Recipe, default_recipe, original_recipe, read_recipe, shipped_recipes
+from navrep_data.train.world_models import Trained, train_world_model
+
+__all__ = [
+    "Recipe",
+    "Trained",
+    "default_recipe",
+    "original_recipe",
+    "read_recipe",
+    "shipped_recipes",
+    "train_world_model",
+]
