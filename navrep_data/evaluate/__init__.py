@@ -1,0 +1,1 @@
+"""Measuring: world-model errors and benchmark suites."""
