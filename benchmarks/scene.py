@@ -86,21 +86,23 @@ def _run_world(
 ):  # fmt: skip
     """Run one world as the generator does, without its rows and resets."""
     humans = int(scalars[lay.S_HUMANS])
+    command = np.zeros(3)
     for _ in range(steps):
         pack_orca(agents, humans + 1, agents32)
         vx, vy = orca_choice(
-            0, agents, agents32, humans, obst_f[0], obst_i[0], int(scalars[lay.S_OBST_ROBOT]), orca_params,
+            0, agents, agents32, 1, humans, obst_f[0], obst_i[0], int(scalars[lay.S_OBST_ROBOT]), orca_params,
             work_f, work_i,
         )  # fmt: skip
         c, s = np.cos(agents[0, lay.A_HEADING]), np.sin(agents[0, lay.A_HEADING])
+        command[0], command[1] = c * vx + s * vy, c * vy - s * vx
         step_world(
             agents, agents32, scalars, edges, polygon_start, boxes, obst_f, obst_i, params, flags, orca_params, work_f,
-            work_i, moves, c * vx + s * vy, c * vy - s * vx, 0.0, result,
+            work_i, moves, command, result,
         )  # fmt: skip
         observe_scan(
-            agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, scan
+            0, agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, scan
         )
-        observe_state(agents, scalars, state)
+        observe_state(0, agents, flags, state)
 
 
 class Ours:

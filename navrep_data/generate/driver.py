@@ -171,8 +171,9 @@ def generate(
     say = report or (lambda _: None)
     started = time.perf_counter()
     config = make_config(
-        env, physics=physics, humans=humans, obstacles=obstacles, rendering="legs" if legs else "trunk"
-    )
+        env, physics=physics, humans=humans, obstacles=obstacles, rendering="legs" if legs else "trunk",
+        curriculum="constant",
+    )  # fmt: skip
     check_seed(seed)
     check_count("workers", workers, 1, MAX_WORKERS)
     chosen = make_policy(policy, policy_batch)
@@ -229,7 +230,7 @@ def _command(
         if value is not None:
             words += [flag, str(value)]
     words += [] if spec.settings.rings else ["--no-rings"]
-    words += [] if spec.settings.humans or not spec.config.max_humans else ["--no-humans-column"]
+    words += [] if spec.settings.humans or not spec.config.max_others else ["--no-humans-column"]
     return shlex.join(words)
 
 

@@ -24,6 +24,7 @@ from navrep_data.io import PART_SUFFIX
 from navrep_data.schema import COLUMNS, UINT16_RANGE_LIMIT
 from navrep_data.shards import LOCK_FILE, MANIFEST_FILE, MAX_SHARD_BYTES, Manifest, estimate_bytes
 from navrep_data.sim import RolloutSettings, SimConfig
+from navrep_data.sim.config import complete as complete_config
 
 DEFAULT_SHARD_ROWS = 20_000
 MAX_SEQUENCES = 2**31 - 1
@@ -58,7 +59,7 @@ def bytes_per_row(spec: DatasetSpec) -> float:
     rows = 1_000_000
     estimate = estimate_bytes(
         spec.columns, rows, n_rays=spec.config.sensor.n_rays, scan_dtype=spec.settings.scan_dtype,
-        max_humans=spec.config.max_humans,
+        max_humans=spec.config.max_others,
     )  # fmt: skip
     return estimate / rows
 
@@ -84,7 +85,7 @@ def check_settings(
         )
     chosen = scan_dtype or ("float32" if far else "uint16")
     return RolloutSettings(
-        check_count("length", length, 1, MAX_LENGTH), chosen, rings, humans and config.max_humans > 0
+        check_count("length", length, 1, MAX_LENGTH), chosen, rings, humans and config.max_others > 0
     )
 
 
@@ -137,7 +138,7 @@ def new_manifest(request: Request) -> Manifest:
         shard_size=request.shard_size,
         scan_dtype=spec.settings.scan_dtype,
         columns=spec.columns,
-        max_humans=spec.config.max_humans if spec.settings.humans else 0,
+        max_humans=spec.config.max_others if spec.settings.humans else 0,
         sensor=spec.config.sensor,
         config=spec.config.to_dict(),
         policy=spec.policy.to_dict(),
@@ -194,7 +195,9 @@ def check_same(old: Manifest, request: Request, explicit_shard_size: bool) -> No
         ("policy_batch", old.policy.get("batch"), new.policy.get("batch")),
         ("columns", ", ".join(old.columns), ", ".join(new.columns)),
     ]
-    pairs += [(key, old.config.get(key), value) for key, value in new.config.items()]
+    # fields at their defaults are left out of stored configs, and older versions did not know all of them
+    before, after = complete_config(old.config), complete_config(new.config)
+    pairs += [(key, before.get(key), value) for key, value in after.items()]
     if explicit_shard_size:
         pairs.append(("shard_size", old.shard_size, new.shard_size))
     for field, seen, asked in pairs:

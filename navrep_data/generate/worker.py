@@ -131,7 +131,7 @@ def new_writer(spec: DatasetSpec, first_sequence: int) -> ShardWriter:
         sensor=spec.config.sensor,
         scan_dtype=spec.settings.scan_dtype,
         columns=spec.columns,
-        max_humans=spec.config.max_humans,
+        max_humans=spec.config.max_others,
         length=spec.settings.length,
         first_sequence=first_sequence,
     )

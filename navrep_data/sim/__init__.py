@@ -2,7 +2,7 @@
 
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
-from navrep_data.sim.registry import describe_environment, environment_names, make_config, numpy_seed
+from navrep_data.sim.registry import describe_environment, environment_names, gymnasium_id, make_config, numpy_seed
 from navrep_data.sim.rollout import (
     CallableRollout,
     PolicyFunction,
@@ -26,6 +26,7 @@ __all__ = [
     "check_seed",
     "describe_environment",
     "environment_names",
+    "gymnasium_id",
     "make_config",
     "numpy_seed",
     "warm_up",

@@ -4,9 +4,9 @@
 import numpy as np
 
 from navrep_data._kernels import kernel
-from navrep_data.sim._layout import S_EPISODE
+from navrep_data.sim._layout import F_ROBOTS, S_EPISODE, S_HUMANS
 from navrep_data.sim._rng import seed_mt, seed_philox
-from navrep_data.sim._step import observe_scan, observe_state, reset_world, step_world
+from navrep_data.sim._step import observe_humans, observe_scan, observe_state, reset_world, step_world
 
 
 @kernel
@@ -16,6 +16,16 @@ def seed_worlds(rng, scalars, seed, first_sequence):
         seed_philox(rng[w], seed, first_sequence + w)
         scalars[w, :] = 0.0
         scalars[w, S_EPISODE] = -1.0
+
+
+@kernel
+def reseed_worlds(rng, scalars, seeds, mask):
+    """Give the worlds of `mask` the streams (seeds[w], 0) and forget their episodes."""
+    for w in range(rng.shape[0]):
+        if mask[w]:
+            seed_philox(rng[w], seeds[w], 0)
+            scalars[w, :] = 0.0
+            scalars[w, S_EPISODE] = -1.0
 
 
 @kernel
@@ -46,25 +56,40 @@ def step_worlds(
     actions, agents, agents32, scalars, edges, polygon_start, boxes, obst_f, obst_i, params, flags, orca_params,
     work_f, work_i, moves, rewards, events,
 ):  # fmt: skip
-    """Advance all worlds by one step under actions (W, 3)."""
-    result = np.zeros(2)
+    """Advance all worlds by one step under actions (W, 3 R); fills rewards (W, R) and events (W,)."""
+    robots = flags[F_ROBOTS]
+    result = np.zeros(robots + 1)
     for w in range(agents.shape[0]):
         step_world(
             agents[w], agents32, scalars[w], edges[w], polygon_start[w], boxes[w], obst_f[w], obst_i[w], params, flags,
-            orca_params, work_f, work_i, moves, actions[w, 0], actions[w, 1], actions[w, 2], result,
+            orca_params, work_f, work_i, moves, actions[w], result,
         )  # fmt: skip
-        rewards[w] = result[0]
-        events[w] = np.uint8(result[1])
+        for r in range(robots):
+            rewards[w, r] = result[r]
+        events[w] = np.uint8(result[robots])
 
 
 @kernel
 def observe_worlds(
     agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, scans, states
 ):  # fmt: skip
-    """Fill scans (W, rays) [m] and robot states (W, 5) of all worlds."""
+    """Fill scans (W R, rays) [m] and robot states (W R, 5) of all worlds, robot by robot."""
+    robots = flags[F_ROBOTS]
     for w in range(agents.shape[0]):
-        observe_scan(
-            agents[w], scalars[w], edges[w], polygon_start[w], circles, dirs, inv_work, owner_work, hits[w],
-            params, flags, scans[w],
-        )  # fmt: skip
-        observe_state(agents[w], scalars[w], states[w])
+        for r in range(robots):
+            k = w * robots + r
+            observe_scan(
+                r, agents[w], scalars[w], edges[w], polygon_start[w], circles, dirs, inv_work, owner_work, hits[k],
+                params, flags, scans[k],
+            )  # fmt: skip
+            observe_state(r, agents[w], flags, states[k])
+
+
+@kernel
+def observe_others(agents, scalars, hits, flags, out):
+    """Fill out (W R, slots, 6) with what each robot's humans column holds."""
+    robots = flags[F_ROBOTS]
+    for w in range(agents.shape[0]):
+        for r in range(robots):
+            k = w * robots + r
+            observe_humans(r, agents[w], robots, int(scalars[w, S_HUMANS]), hits[k], out[k])

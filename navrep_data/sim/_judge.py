@@ -11,21 +11,26 @@ from navrep_data._kernels import kernel
 from navrep_data.schema import Event
 from navrep_data.sim._geometry import point_segment_sq, swept_clearance
 from navrep_data.sim._layout import (
+    A_CLEAR_HUMAN,
+    A_CLEAR_STATIC,
+    A_DAMAGE,
     A_GX,
     A_GY,
+    A_HIT,
     A_RADIUS,
+    A_TAKEN,
     A_X,
     A_Y,
+    F_DAMAGE,
     P_DANGER_DIST,
     P_DT,
+    P_GOAL_RADIUS,
+    P_MAX_DAMAGE,
     P_REWARD_COLLISION,
     P_REWARD_DANGER,
     P_REWARD_GOAL,
     P_REWARD_PROGRESS,
     P_TIME_LIMIT,
-    S_CLEAR_HUMAN,
-    S_CLEAR_STATIC,
-    S_HUMANS,
     S_POLYGONS,
     S_STEP,
 )
@@ -40,55 +45,76 @@ CUT = int(Event.CUT)
 
 
 @kernel
-def human_clearance(agents, n_humans, moves, dt):
-    """Return the smallest gap between the robot's disc and a human's while all move straight for dt [m].
-
-    `moves` (N, 2) holds everybody's velocity during the step [m/s].
-    """
-    best = np.inf
-    for j in range(1, n_humans + 1):
-        rx = agents[j, A_X] - agents[0, A_X]
-        ry = agents[j, A_Y] - agents[0, A_Y]
-        ex = rx + (moves[j, 0] - moves[0, 0]) * dt
-        ey = ry + (moves[j, 1] - moves[0, 1]) * dt
-        gap = np.sqrt(point_segment_sq(0.0, 0.0, rx, ry, ex, ey)) - agents[j, A_RADIUS] - agents[0, A_RADIUS]
-        if gap < best:
-            best = gap
-    return best
+def agent_gap(i, j, agents, moves, dt):
+    """Return the smallest gap between two agents' discs while both move straight for dt [m]; see `measure`."""
+    rx = agents[j, A_X] - agents[i, A_X]
+    ry = agents[j, A_Y] - agents[i, A_Y]
+    ex = rx + (moves[j, 0] - moves[i, 0]) * dt
+    ey = ry + (moves[j, 1] - moves[i, 1]) * dt
+    return np.sqrt(point_segment_sq(0.0, 0.0, rx, ry, ex, ey)) - agents[j, A_RADIUS] - agents[i, A_RADIUS]
 
 
 @kernel
-def judge(agents, scalars, edges, polygon_start, moves, params, result):
-    """Fill result with (reward, event) of the step that `moves` describes, before anybody has moved.
+def measure(r, agents, n_agents, scalars, edges, polygon_start, moves, dt):
+    """Write robot r's smallest gaps to other agents and to obstacles during a step, before anybody has moved [m].
+
+    `moves` (N, 3) holds everybody's velocity during the step [m/s].
+    """
+    best = np.inf
+    for j in range(n_agents):
+        if j != r:
+            gap = agent_gap(r, j, agents, moves, dt)
+            if gap < best:
+                best = gap
+    agents[r, A_CLEAR_HUMAN] = best
+    x0, y0 = agents[r, A_X], agents[r, A_Y]
+    x1, y1 = x0 + moves[r, 0] * dt, y0 + moves[r, 1] * dt
+    to_static = swept_clearance(x0, y0, x1, y1, edges, polygon_start, int(scalars[S_POLYGONS]))
+    agents[r, A_CLEAR_STATIC] = to_static - agents[r, A_RADIUS]
+
+
+@kernel
+def reach_of_goal(r, agents, params):
+    """Return how near to its goal robot r's centre must come [m]."""
+    return params[P_GOAL_RADIUS] if params[P_GOAL_RADIUS] > 0.0 else agents[r, A_RADIUS]
+
+
+@kernel
+def judge(r, agents, scalars, moves, params, flags):
+    """Return (reward, event) of robot r's step that `moves` describes, measured and not yet made.
 
     A collision outranks the goal, the goal outranks the time limit. Goal: the robot's centre ends nearer to the goal
-    than its radius. The time limit ends the episode after round(limit / dt) steps.
+    than the goal radius. The time limit ends the episode after round(limit / dt) steps. Where collisions do damage,
+    they cost their share of the damage that ends an episode.
     """
     dt = params[P_DT]
-    x0, y0 = agents[0, A_X], agents[0, A_Y]
-    x1, y1 = x0 + moves[0, 0] * dt, y0 + moves[0, 1] * dt
-    radius = agents[0, A_RADIUS]
-    to_human = human_clearance(agents, int(scalars[S_HUMANS]), moves, dt)
-    to_static = swept_clearance(x0, y0, x1, y1, edges, polygon_start, int(scalars[S_POLYGONS])) - radius
-    scalars[S_CLEAR_HUMAN] = to_human
-    scalars[S_CLEAR_STATIC] = to_static
-    before = np.hypot(agents[0, A_GX] - x0, agents[0, A_GY] - y0)
-    after = np.hypot(agents[0, A_GX] - x1, agents[0, A_GY] - y1)
+    x0, y0 = agents[r, A_X], agents[r, A_Y]
+    x1, y1 = x0 + moves[r, 0] * dt, y0 + moves[r, 1] * dt
+    to_human, to_static = agents[r, A_CLEAR_HUMAN], agents[r, A_CLEAR_STATIC]
+    before = np.hypot(agents[r, A_GX] - x0, agents[r, A_GY] - y0)
+    after = np.hypot(agents[r, A_GX] - x1, agents[r, A_GY] - y1)
     reward = params[P_REWARD_PROGRESS] * (before - after)
     if min(to_human, to_static) < params[P_DANGER_DIST]:
         reward += params[P_REWARD_DANGER]
     event = NONE
-    if to_human < 0.0:
+    if flags[F_DAMAGE]:
+        if agents[r, A_DAMAGE] >= params[P_MAX_DAMAGE]:
+            event = int(agents[r, A_HIT])
+    elif to_human < 0.0:
         event = COLLISION_HUMAN
     elif to_static < 0.0:
         event = COLLISION_OBSTACLE
-    elif after < radius:
-        event = GOAL
-    elif scalars[S_STEP] + 1.0 >= np.round(params[P_TIME_LIMIT] / dt):
-        event = TIMEOUT
-    if event == COLLISION_HUMAN or event == COLLISION_OBSTACLE:
+    if event == NONE:
+        if after < reach_of_goal(r, agents, params):
+            event = GOAL
+        elif scalars[S_STEP] + 1.0 >= np.round(params[P_TIME_LIMIT] / dt):
+            event = TIMEOUT
+    if flags[F_DAMAGE]:
+        most = params[P_MAX_DAMAGE]
+        taken = min(agents[r, A_DAMAGE], most) - min(agents[r, A_DAMAGE] - agents[r, A_TAKEN], most)
+        reward += params[P_REWARD_COLLISION] * taken / most
+    elif event == COLLISION_HUMAN or event == COLLISION_OBSTACLE:
         reward += params[P_REWARD_COLLISION]
-    elif event == GOAL:
+    if event == GOAL:
         reward += params[P_REWARD_GOAL]
-    result[0] = reward
-    result[1] = event
+    return reward, event

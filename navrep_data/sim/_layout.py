@@ -4,7 +4,7 @@ State lives in a few two-dimensional arrays because array arguments are expensiv
 These are names for columns, not configuration.
 """
 
-# --- agents (N, AGENT_FIELDS) float64, world frame; row 0 is the robot, rows 1..n the humans -------------------------
+# --- agents (N, AGENT_FIELDS) float64, world frame; rows 0..R-1 are the robots, then the humans ---------------------
 A_X = 0
 A_Y = 1
 A_VX = 2
@@ -18,7 +18,19 @@ A_SEES = 9  # 1 where this human takes the robot for a neighbour
 A_GAIT_X = 10  # distance walked forward since the start of the episode [m]
 A_GAIT_Y = 11  # distance walked sideways [m]
 A_GAIT_T = 12  # heading accumulated [rad]
-AGENT_FIELDS = 13
+# robots only
+A_OMEGA = 13  # rotation during the last step, or with inertia that of the next [rad/s]
+A_AX = 14  # acceleration, for inertia [m/s2], world frame
+A_AY = 15
+A_AOMEGA = 16  # [rad/s2]
+A_DAMAGE = 17  # taken since reset [m/s]
+A_EVENT = 18  # what the last step led to, for this robot
+A_CLEAR_HUMAN = 19  # smallest gap to another agent during the last step [m]
+A_CLEAR_STATIC = 20  # smallest gap to an obstacle during the last step [m]
+# scratch of a step
+A_HIT = 21  # the collision's event where this agent is put back
+A_TAKEN = 22  # damage taken [m/s]
+AGENT_FIELDS = 23
 
 # --- scalars (SCALAR_FIELDS,) float64, per world --------------------------------------------------------------------
 S_TIME = 0  # simulated time since reset [s]
@@ -32,11 +44,15 @@ S_XMAX = 7
 S_YMAX = 8
 S_OBST_HUMAN = 9  # post-split obstacle edges known to the humans
 S_OBST_ROBOT = 10  # ... to the robot
-S_OMEGA = 11  # last rotation command [rad/s], as far as the observation shows it
-S_EPISODE = 12  # episodes started since the world was made, minus one
-S_CLEAR_HUMAN = 13  # smallest gap to a human during the last step [m]
-S_CLEAR_STATIC = 14  # smallest gap to an obstacle during the last step [m]
-SCALAR_FIELDS = 15
+S_EPISODE = 11  # episodes started since the world was made, minus one
+S_CLEAR_HUMAN = 12  # smallest gap of a robot to another agent during the last step [m]
+S_CLEAR_STATIC = 13  # smallest gap of a robot to an obstacle during the last step [m]
+S_EVENT = 14  # how the episode ended, 0 while it goes on
+S_FEWER_HUMANS = 15  # adaptive curriculum: how many fewer than the most difficult setting
+S_FEWER_OBSTACLES = 16
+S_NOISE_HIGH = 17  # key of the episode's scan noise: the upper and the lower 32 bits
+S_NOISE_LOW = 18
+SCALAR_FIELDS = 19
 
 # --- params (PARAM_FIELDS,) float64, one array per config -----------------------------------------------------------
 P_DT = 0
@@ -63,7 +79,13 @@ P_RADIUS_LOW = 20
 P_RADIUS_HIGH = 21
 P_VPREF_LOW = 22
 P_VPREF_HIGH = 23
-PARAM_FIELDS = 24
+P_GOAL_RADIUS = 24  # 0: the robot's radius
+P_MAX_DAMAGE = 25
+P_ACCELERATION = 26  # three: x, y, rotation
+P_JERK = 29  # three
+P_SCAN_NOISE = 32
+P_SCAN_DROPOUT = 33
+PARAM_FIELDS = 34
 
 # --- boxes (P, BOX_FIELDS) float64, per world: what the recipe knows of each polygon but the border -------------------
 # consistent: centre x, y and half sides [m]. original: the cells of the collision grid that the obstacle fills
@@ -82,7 +104,26 @@ F_GAP_QUIRK = 3  # 1: the original renderer's invisible agents
 F_SCAN_MM = 4  # 1: scans leave the kernel as uint16 millimetres
 F_WANT_HUMANS = 5  # 1: fill the humans column
 F_POLICY = 6  # one of POLICY_*
-FLAG_FIELDS = 7
+F_ELLIPSE = 7  # 1: ellipses in the lidar
+F_ROBOTS = 8  # number of robots
+F_WORLD = 9  # one of WORLD_*
+F_HUMAN_POLICY = 10  # one of HUMANS_*
+F_DIFFERENTIAL = 11  # 1: the sideways command is 0
+F_INERTIA = 12  # 1: acceleration and jerk are limited
+F_DAMAGE = 13  # 1: collisions do damage and put back, 0: they end the episode
+F_ADAPTIVE = 14  # 1: adaptive curriculum
+F_NOISE = 15  # 1: scans have noise or dropout
+F_HIDE_OMEGA = 16  # 1: the robot state shows a rotation of 0
+FLAG_FIELDS = 17
+
+WORLD_POLYGONS = 0
+WORLD_EMPTY = 1
+WORLD_MAP = 2
+
+HUMANS_ORCA = 0
+HUMANS_STATIC = 1
+HUMANS_CONSTANT_VELOCITY = 2
+HUMANS_PLANNED = 3
 
 POLICY_ORCA = 0
 POLICY_GOAL_MOMENTUM = 1

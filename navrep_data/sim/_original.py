@@ -11,7 +11,7 @@ import numpy as np
 
 from navrep_data._kernels import kernel
 from navrep_data.sim._geometry import point_segment_sq
-from navrep_data.sim._judge import COLLISION_HUMAN, COLLISION_OBSTACLE, GOAL, NONE, TIMEOUT
+from navrep_data.sim._judge import COLLISION_HUMAN, COLLISION_OBSTACLE, GOAL, NONE, TIMEOUT, reach_of_goal
 from navrep_data.sim._layout import (
     A_GAIT_T,
     A_GAIT_X,
@@ -50,6 +50,8 @@ from navrep_data.sim._layout import (
     S_BORDER,
     S_CLEAR_HUMAN,
     S_CLEAR_STATIC,
+    S_FEWER_HUMANS,
+    S_FEWER_OBSTACLES,
     S_HUMANS,
     S_POLYGONS,
     S_TIME,
@@ -132,10 +134,11 @@ def _place_square(agents, n, radius, gap, rng):
 
 
 @kernel
-def _place_humans(agents, rng, params, flags):
+def _place_humans(agents, scalars, rng, params, flags):
     """Draw all humans; returns their number, or -1 where one found no place."""
     gap = params[P_DANGER_DIST]
-    wanted = min(int(np.rint(params[P_HUMANS] * (0.5 + uniform(rng)))), agents.shape[0] - 1)
+    humans = params[P_HUMANS] - scalars[S_FEWER_HUMANS]
+    wanted = min(int(np.rint(humans * (0.5 + uniform(rng)))), agents.shape[0] - 1)
     uniform(rng)  # the number of other robots, always 0
     for n in range(1, wanted + 1):
         agents[n, :] = 0.0
@@ -177,13 +180,13 @@ def set_cells(box, ix, iy, size_x, size_y):
 
 
 @kernel
-def _place_obstacles(agents, vertices, polygon_start, boxes, rng, params):
+def _place_obstacles(agents, scalars, vertices, polygon_start, boxes, rng, params):
     """Draw squares and walls: polygons, inflated, and cells at true size. Returns their number, -1 where one failed."""
     scale = params[P_POLYGON_SCALE]
     gap = agents[0, A_RADIUS] + params[P_DANGER_DIST]
     x0, y0, x1, y1 = agents[0, A_X], agents[0, A_Y], agents[0, A_GX], agents[0, A_GY]
-    n_squares = int(np.rint(uniform(rng) * params[P_SQUARES]))
-    n_walls = int(np.rint(uniform(rng) * params[P_WALLS]))
+    n_squares = int(np.rint(uniform(rng) * (params[P_SQUARES] - scalars[S_FEWER_OBSTACLES])))
+    n_walls = int(np.rint(uniform(rng) * (params[P_WALLS] - scalars[S_FEWER_OBSTACLES])))
     for n in range(n_squares + n_walls):
         placed = False
         for _ in range(PLACE_LIMIT):
@@ -224,12 +227,12 @@ def draw_original(agents, scalars, vertices, polygon_start, boxes, rng, params, 
     agents[0, A_RADIUS] = between(rng, params[P_RADIUS_LOW], params[P_RADIUS_HIGH])
     ring = min(ROBOT_RADIUS_CAP, CIRCLE_RADIUS * (1.0 + uniform(rng) * 2.0))
     agents[0, A_Y], agents[0, A_GY] = -ring, ring
-    n_humans = _place_humans(agents, rng, params, flags)
+    n_humans = _place_humans(agents, scalars, rng, params, flags)
     if n_humans < 0:
         return False
     scalars[S_HUMANS] = n_humans
     polygon_start[0] = 0
-    n_polygons = _place_obstacles(agents, vertices, polygon_start, boxes, rng, params)
+    n_polygons = _place_obstacles(agents, scalars, vertices, polygon_start, boxes, rng, params)
     if n_polygons < 0:
         return False
     scalars[S_POLYGONS] = n_polygons
@@ -294,7 +297,7 @@ def _nearest_human(agents, n_humans, moves, dt):
 
 
 @kernel
-def judge_original(agents, scalars, boxes, moves, omega, params, result):
+def judge_original(agents, scalars, boxes, moves, params, result):
     """Fill result with (reward, event) of the step, before anybody has moved; the first condition that holds decides.
 
     Time, goal, collision with a human, with a cell or the border; then, while the episode goes on: a cell within
@@ -321,7 +324,7 @@ def judge_original(agents, scalars, boxes, moves, omega, params, result):
     reward = 0.0
     if scalars[S_TIME] >= params[P_TIME_LIMIT]:
         event = TIMEOUT
-    elif after < radius:
+    elif after < reach_of_goal(0, agents, params):
         event = GOAL
         reward = params[P_REWARD_GOAL]
     elif to_human < 0.0:
@@ -337,6 +340,6 @@ def judge_original(agents, scalars, boxes, moves, omega, params, result):
         elif to_human < params[P_DANGER_DIST]:
             reward += NEAR_HUMAN_FACTOR * (to_human - params[P_DANGER_DIST])
         else:
-            reward += ROTATION_FACTOR * abs(omega * dt)
+            reward += ROTATION_FACTOR * abs(moves[0, 2] * dt)
     result[0] = reward
     result[1] = event

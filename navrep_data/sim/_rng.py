@@ -60,15 +60,8 @@ def _mul128(a, b):
 
 
 @kernel
-def _philox_block(rng):
-    """Advance the counter and fill the buffer with four words."""
-    for i in range(4):
-        word = _add64(rng[_COUNTER + i], np.uint64(1))
-        rng[_COUNTER + i] = word
-        if word != np.uint64(0):
-            break
-    c0, c1, c2, c3 = rng[_COUNTER], rng[_COUNTER + 1], rng[_COUNTER + 2], rng[_COUNTER + 3]
-    k0, k1 = rng[_KEY], rng[_KEY + 1]
+def philox(k0, k1, c0, c1, c2, c3):
+    """Return the four words of one Philox4x64-10 block: key k, counter c."""
     for r in range(_ROUNDS):
         if r > 0:
             k0 = _add64(k0, _W0)
@@ -76,6 +69,20 @@ def _philox_block(rng):
         high0, low0 = _mul128(_M0, c0)
         high1, low1 = _mul128(_M1, c2)
         c0, c1, c2, c3 = high1 ^ c1 ^ k0, low1, high0 ^ c3 ^ k1, low0
+    return c0, c1, c2, c3
+
+
+@kernel
+def _philox_block(rng):
+    """Advance the counter and fill the buffer with four words."""
+    for i in range(4):
+        word = _add64(rng[_COUNTER + i], np.uint64(1))
+        rng[_COUNTER + i] = word
+        if word != np.uint64(0):
+            break
+    c0, c1, c2, c3 = philox(
+        rng[_KEY], rng[_KEY + 1], rng[_COUNTER], rng[_COUNTER + 1], rng[_COUNTER + 2], rng[_COUNTER + 3]
+    )
     rng[_BUFFER] = c0
     rng[_BUFFER + 1] = c1
     rng[_BUFFER + 2] = c2
@@ -134,6 +141,14 @@ def seed_mt(rng, seed):
 def is_mersenne(rng):
     """Return whether the stream is one of numpy's legacy generator."""
     return rng[_KIND] == _KIND_MT
+
+
+@kernel
+def stream_key(rng):
+    """Return the two words that name a stream: a Philox key, or the seed of a legacy stream not yet drawn from."""
+    if rng[_KIND] == _KIND_MT:
+        return rng[0], _KIND_MT
+    return rng[_KEY], rng[_KEY + 1]
 
 
 @kernel

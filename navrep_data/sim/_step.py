@@ -4,14 +4,19 @@
 import numpy as np
 
 from navrep_data._kernels import kernel
-from navrep_data.sim._judge import judge
+from navrep_data.sim._ellipse import body_ellipse, scan_ellipses
+from navrep_data.sim._judge import GOAL, NONE, judge, measure
 from navrep_data.sim._layout import (
+    A_CLEAR_HUMAN,
+    A_CLEAR_STATIC,
+    A_EVENT,
     A_GAIT_T,
     A_GAIT_X,
     A_GAIT_Y,
     A_GX,
     A_GY,
     A_HEADING,
+    A_OMEGA,
     A_RADIUS,
     A_SEES,
     A_VPREF,
@@ -19,28 +24,49 @@ from navrep_data.sim._layout import (
     A_VY,
     A_X,
     A_Y,
+    F_ADAPTIVE,
+    F_DAMAGE,
+    F_ELLIPSE,
     F_GAP_QUIRK,
+    F_HIDE_OMEGA,
+    F_HUMAN_POLICY,
     F_LEGS,
+    F_NOISE,
     F_ORIGINAL,
+    F_ROBOTS,
+    F_WORLD,
+    HUMANS_CONSTANT_VELOCITY,
+    HUMANS_ORCA,
     P_ANGLE_INCREMENT,
     P_ANGLE_MIN,
     P_BORDER_GAP,
     P_DT,
+    P_HUMANS,
     P_RANGE_MAX,
+    P_SQUARES,
+    S_CLEAR_HUMAN,
+    S_CLEAR_STATIC,
     S_EPISODE,
+    S_EVENT,
+    S_FEWER_HUMANS,
+    S_FEWER_OBSTACLES,
     S_HUMANS,
+    S_NOISE_HIGH,
+    S_NOISE_LOW,
     S_OBST_HUMAN,
     S_OBST_ROBOT,
-    S_OMEGA,
     S_POLYGONS,
     S_STEP,
     S_TIME,
+    WORLD_EMPTY,
 )
 from navrep_data.sim._lidar import leg_circles, scan_world
+from navrep_data.sim._noise import disturb, noise_key
 from navrep_data.sim._obstacles import build_obstacles
 from navrep_data.sim._orca import orca_velocity
 from navrep_data.sim._original import draw_original, judge_original, walk_original
 from navrep_data.sim._rng import is_mersenne
+from navrep_data.sim._robots import first_event, move_robot, propose, put_back
 from navrep_data.sim._worlds import add_border, draw_world
 
 # orca.py of the original: agents enter RVO2 with their radius plus 1 cm
@@ -75,37 +101,65 @@ def pack_orca(agents, n_agents, agents32):
 
 
 @kernel
-def orca_choice(i, agents, agents32, n_humans, obst_f, obst_i, n_obst, orca_params, work_f, work_i):
-    """Return the ORCA velocity of agent i (0 = the robot, which sees all humans) [m/s], world frame."""
+def orca_choice(i, agents, agents32, n_robots, n_humans, obst_f, obst_i, n_obst, orca_params, work_f, work_i):
+    """Return the ORCA velocity of agent i [m/s], world frame; a robot sees everybody, a human perhaps no robot."""
     px = agents[i, A_GX] - agents[i, A_X]
     py = agents[i, A_GY] - agents[i, A_Y]
     distance = np.hypot(px, py)
     if distance > 1.0:  # orca.py: the preferred speed is 1 m/s, or less within a metre of the goal
         px /= distance
         py /= distance
-    extra = 0 if i > 0 and agents[i, A_SEES] > 0.5 else -1
+    sees = i < n_robots or agents[i, A_SEES] > 0.5
+    first, extra = n_robots, -1
+    if n_robots > 1:
+        first = 0 if sees else n_robots
+    elif i > 0 and sees:
+        extra = 0
     return orca_velocity(
-        i, agents32, 1, n_humans + 1, extra, np.float32(px), np.float32(py),
+        i, agents32, first, n_robots + n_humans, extra, np.float32(px), np.float32(py),
         obst_f, obst_i, n_obst, orca_params, work_f, work_i,
     )  # fmt: skip
 
 
 @kernel
-def choose_humans(agents, agents32, scalars, obst_f, obst_i, orca_params, work_f, work_i, moves):
-    """Let every human choose its velocity from the present state; writes moves[1:]."""
-    n = int(scalars[S_HUMANS])
-    pack_orca(agents, n + 1, agents32)
-    n_obst = int(scalars[S_OBST_HUMAN])
-    for i in range(1, n + 1):
-        vx, vy = orca_choice(i, agents, agents32, n, obst_f[0], obst_i[0], n_obst, orca_params, work_f, work_i)
-        moves[i, 0] = vx
-        moves[i, 1] = vy
+def _walk_straight(agents, i, at_start, moves):
+    """Let human i walk at its own speed in the direction in which its goal lay at the start."""
+    c, s = np.cos(agents[i, A_HEADING]), np.sin(agents[i, A_HEADING])
+    if at_start:
+        gx, gy = agents[i, A_GX] - agents[i, A_X], agents[i, A_GY] - agents[i, A_Y]
+        distance = np.hypot(gx, gy)
+        if distance > 0.0:
+            c, s = gx / distance, gy / distance
+    moves[i, 0] = agents[i, A_VPREF] * c
+    moves[i, 1] = agents[i, A_VPREF] * s
 
 
 @kernel
-def move_humans(agents, n_humans, moves, dt):
-    """Move the humans and their legs; a human that stands keeps its heading."""
-    for i in range(1, n_humans + 1):
+def choose_humans(agents, agents32, scalars, obst_f, obst_i, flags, orca_params, work_f, work_i, moves):
+    """Let every human choose its velocity from the present state; writes their rows of moves."""
+    n = int(scalars[S_HUMANS])
+    robots = flags[F_ROBOTS]
+    policy = flags[F_HUMAN_POLICY]
+    if policy == HUMANS_ORCA:
+        pack_orca(agents, robots + n, agents32)
+        n_obst = int(scalars[S_OBST_HUMAN])
+        for i in range(robots, robots + n):
+            vx, vy = orca_choice(
+                i, agents, agents32, robots, n, obst_f[0], obst_i[0], n_obst, orca_params, work_f, work_i
+            )
+            moves[i, 0] = vx
+            moves[i, 1] = vy
+    else:
+        for i in range(robots, robots + n):
+            moves[i, 0], moves[i, 1] = 0.0, 0.0
+            if policy == HUMANS_CONSTANT_VELOCITY:
+                _walk_straight(agents, i, scalars[S_TIME] == 0.0, moves)
+
+
+@kernel
+def move_humans(agents, first, stop, moves, dt):
+    """Move the humans, rows first to stop, and their legs; a human that stands keeps its heading."""
+    for i in range(first, stop):
         vx, vy = moves[i, 0], moves[i, 1]
         before = agents[i, A_HEADING]
         heading = before
@@ -134,7 +188,8 @@ def build_trees(vertices, polygon_start, scalars, obst_f, obst_i):
 
 @kernel
 def begin_original(
-    agents, agents32, scalars, vertices, polygon_start, obst_f, obst_i, params, orca_params, work_f, work_i, moves
+    agents, agents32, scalars, vertices, polygon_start, obst_f, obst_i, params, flags, orca_params, work_f, work_i,
+    moves,
 ):  # fmt: skip
     """Take the hidden first step of a drawn `original` world and close it; returns False where a tree does not fit.
 
@@ -145,12 +200,15 @@ def begin_original(
     if scalars[S_OBST_HUMAN] < 0.0:
         return False
     n_humans = int(scalars[S_HUMANS])
-    choose_humans(agents, agents32, scalars, obst_f, obst_i, orca_params, work_f, work_i, moves)
+    choose_humans(agents, agents32, scalars, obst_f, obst_i, flags, orca_params, work_f, work_i, moves)
     walk_original(agents, n_humans, moves, params[P_DT])
     scalars[S_TIME] = params[P_DT]
     for i in range(1, n_humans + 1):
         agents[i, A_GAIT_X], agents[i, A_GAIT_Y], agents[i, A_GAIT_T] = 0.0, 0.0, 0.0
-    n_polygons = add_border(agents, scalars, vertices, polygon_start, n_polygons, params[P_BORDER_GAP])
+    if flags[F_WORLD] == WORLD_EMPTY:
+        scalars[S_OBST_ROBOT] = scalars[S_OBST_HUMAN]
+        return True
+    n_polygons = add_border(agents, n_humans + 1, scalars, vertices, polygon_start, n_polygons, params[P_BORDER_GAP])
     scalars[S_POLYGONS] = n_polygons
     # the original lists the border's corners from the upper left; RVO2's tree depends on the order of the edges
     first = polygon_start[n_polygons - 1]
@@ -164,27 +222,50 @@ def begin_original(
 
 
 @kernel
+def adapt(scalars, params):
+    """Adapt the difficulty to how the last episode ended; one that was broken off changes nothing.
+
+    navreptrainenv.py: one more of everything after the goal, one less otherwise, within zero and the most.
+    """
+    if scalars[S_EVENT] == GOAL:
+        scalars[S_FEWER_HUMANS] = max(scalars[S_FEWER_HUMANS] - 1.0, 0.0)
+        scalars[S_FEWER_OBSTACLES] = max(scalars[S_FEWER_OBSTACLES] - 1.0, 0.0)
+    elif scalars[S_EVENT] != NONE:
+        scalars[S_FEWER_HUMANS] = min(scalars[S_FEWER_HUMANS] + 1.0, params[P_HUMANS])
+        scalars[S_FEWER_OBSTACLES] = min(scalars[S_FEWER_OBSTACLES] + 1.0, params[P_SQUARES])
+
+
+@kernel
 def reset_world(
     agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags,
     orca_params, work_f, work_i, moves,
 ):  # fmt: skip
     """Draw the next episode of a world; returns False if no world fits the arrays."""
-    episode = scalars[S_EPISODE]
+    if flags[F_ADAPTIVE]:
+        adapt(scalars, params)
+    episode = scalars[S_EPISODE] + 1.0
+    fewer_humans, fewer_obstacles = scalars[S_FEWER_HUMANS], scalars[S_FEWER_OBSTACLES]
+    noise_high, noise_low = 0.0, 0.0
+    if flags[F_NOISE]:
+        noise_high, noise_low = noise_key(rng, episode)
     # a numpy-seeded stream stands for one episode: another draw would be another episode under the same number
     draws = 1 if is_mersenne(rng) else MAX_REDRAWS + 1
     for _ in range(draws):
         scalars[:] = 0.0
-        scalars[S_EPISODE] = episode + 1.0
+        scalars[S_EPISODE] = episode
+        scalars[S_FEWER_HUMANS], scalars[S_FEWER_OBSTACLES] = fewer_humans, fewer_obstacles
+        scalars[S_NOISE_HIGH], scalars[S_NOISE_LOW] = noise_high, noise_low
         if flags[F_ORIGINAL]:
             ready = draw_original(
                 agents, scalars, vertices, polygon_start, boxes, rng, params, flags
             ) and begin_original(
-                agents, agents32, scalars, vertices, polygon_start, obst_f, obst_i, params, orca_params, work_f,
-                work_i, moves,
+                agents, agents32, scalars, vertices, polygon_start, obst_f, obst_i, params, flags, orca_params,
+                work_f, work_i, moves,
             )  # fmt: skip
         else:
-            draw_world(agents, scalars, vertices, polygon_start, boxes, rng, params, flags)
-            ready = build_trees(vertices, polygon_start, scalars, obst_f, obst_i)
+            ready = draw_world(agents, scalars, vertices, polygon_start, boxes, rng, params, flags) and build_trees(
+                vertices, polygon_start, scalars, obst_f, obst_i
+            )
         if ready:
             fill_edges(vertices, polygon_start, int(scalars[S_POLYGONS]), edges)
             return True
@@ -194,104 +275,153 @@ def reset_world(
 @kernel
 def step_world(
     agents, agents32, scalars, edges, polygon_start, boxes, obst_f, obst_i,
-    params, flags, orca_params, work_f, work_i, moves, ax, ay, omega, result,
+    params, flags, orca_params, work_f, work_i, moves, commands, result,
 ):  # fmt: skip
-    """Advance a world by one step under the body command (ax, ay [m/s], omega [rad/s]); fills result (reward, event).
+    """Advance a world by one step under the robots' body commands (vx, vy [m/s], omega [rad/s], three numbers each).
 
-    Humans choose from the state before the step; then the step is judged; then everybody moves: the robot translates
-    along its old heading and turns afterwards, as the original does.
+    Fills result with one reward per robot, then the event. Humans choose from the state before the step; then the step
+    is judged; then everybody moves: a robot translates along its old heading and turns afterwards, as the original
+    does.
     """
     dt = params[P_DT]
-    choose_humans(agents, agents32, scalars, obst_f, obst_i, orca_params, work_f, work_i, moves)
-    c, s = np.cos(agents[0, A_HEADING]), np.sin(agents[0, A_HEADING])
-    moves[0, 0] = c * ax - s * ay
-    moves[0, 1] = s * ax + c * ay
+    robots = flags[F_ROBOTS]
+    stop = robots + int(scalars[S_HUMANS])
+    choose_humans(agents, agents32, scalars, obst_f, obst_i, flags, orca_params, work_f, work_i, moves)
+    for r in range(robots):
+        propose(r, agents, flags, commands, moves)
     original = flags[F_ORIGINAL] != 0
+    event = NONE
     if original:
-        judge_original(agents, scalars, boxes, moves, omega, params, result)
+        judge_original(agents, scalars, boxes, moves, params, result)
+        event = int(result[1])
+        agents[0, A_EVENT] = event
+        agents[0, A_CLEAR_HUMAN], agents[0, A_CLEAR_STATIC] = scalars[S_CLEAR_HUMAN], scalars[S_CLEAR_STATIC]
     else:
-        judge(agents, scalars, edges, polygon_start, moves, params, result)
-    agents[0, A_X] += moves[0, 0] * dt
-    agents[0, A_Y] += moves[0, 1] * dt
-    agents[0, A_VX] = moves[0, 0]
-    agents[0, A_VY] = moves[0, 1]
-    agents[0, A_HEADING] = (agents[0, A_HEADING] + omega * dt) % TWO_PI
+        for r in range(robots):
+            measure(r, agents, stop, scalars, edges, polygon_start, moves, dt)
+        if flags[F_DAMAGE]:
+            put_back(agents, robots, stop, scalars, edges, polygon_start, moves, dt)
+        for r in range(robots):
+            result[r], mine = judge(r, agents, scalars, moves, params, flags)
+            agents[r, A_EVENT] = mine
+            if r == 0:
+                event = mine
+                scalars[S_CLEAR_HUMAN], scalars[S_CLEAR_STATIC] = agents[0, A_CLEAR_HUMAN], agents[0, A_CLEAR_STATIC]
+            else:
+                event = first_event(event, mine)
+                scalars[S_CLEAR_HUMAN] = min(scalars[S_CLEAR_HUMAN], agents[r, A_CLEAR_HUMAN])
+                scalars[S_CLEAR_STATIC] = min(scalars[S_CLEAR_STATIC], agents[r, A_CLEAR_STATIC])
+        result[robots] = event
+    for r in range(robots):
+        move_robot(r, agents, params, flags, commands, moves)
     if original:
         walk_original(agents, int(scalars[S_HUMANS]), moves, dt)
     else:
-        move_humans(agents, int(scalars[S_HUMANS]), moves, dt)
-        scalars[S_OMEGA] = omega  # the original observes 0
+        move_humans(agents, robots, stop, moves, dt)
+    if scalars[S_EVENT] == NONE:
+        scalars[S_EVENT] = event
     scalars[S_TIME] += dt
     scalars[S_STEP] += 1.0
 
 
 @kernel
-def fill_circles(agents, n_humans, legs, circles):
-    """Write the humans' circles as the lidar sees them (two legs or one trunk); returns how many.
+def fill_bodies(i, agents, owner, flags, rows):
+    """Write agent i as the lidar sees it to the first of `rows` (two legs, a trunk or an ellipse); returns how many."""
+    if flags[F_LEGS]:
+        speed = np.hypot(agents[i, A_VX], agents[i, A_VY])
+        leg_circles(
+            agents[i, A_X], agents[i, A_Y], agents[i, A_HEADING], speed,
+            agents[i, A_GAIT_X], agents[i, A_GAIT_Y], agents[i, A_GAIT_T], owner, rows[:2],
+        )  # fmt: skip
+        return 2
+    if flags[F_ELLIPSE]:
+        body_ellipse(agents[i, A_X], agents[i, A_Y], agents[i, A_HEADING], agents[i, A_RADIUS], owner, rows[0])
+    else:
+        rows[0, 0] = agents[i, A_X]
+        rows[0, 1] = agents[i, A_Y]
+        rows[0, 2] = agents[i, A_RADIUS]
+        rows[0, 3] = owner
+    return 1
 
-    The fourth column is the owner: human i has owner i - 1.
+
+@kernel
+def fill_circles(r, agents, n_robots, n_humans, flags, circles):
+    """Write all that the lidar of robot r sees of agents; returns how many rows. r = -1: the humans alone.
+
+    The fourth column is the owner: humans from 0, then the other robots.
     """
     count = 0
-    for i in range(1, n_humans + 1):
-        if legs:
-            speed = np.hypot(agents[i, A_VX], agents[i, A_VY])
-            leg_circles(
-                agents[i, A_X], agents[i, A_Y], agents[i, A_HEADING], speed,
-                agents[i, A_GAIT_X], agents[i, A_GAIT_Y], agents[i, A_GAIT_T], i - 1, circles[count : count + 2],
-            )  # fmt: skip
-            count += 2
-        else:
-            circles[count, 0] = agents[i, A_X]
-            circles[count, 1] = agents[i, A_Y]
-            circles[count, 2] = agents[i, A_RADIUS]
-            circles[count, 3] = i - 1
-            count += 1
+    for i in range(n_humans):
+        count += fill_bodies(n_robots + i, agents, i, flags, circles[count:])
+    if r >= 0:
+        owner = n_humans
+        for i in range(n_robots):
+            if i != r:
+                count += fill_bodies(i, agents, owner, flags, circles[count:])
+                owner += 1
     return count
 
 
 @kernel
 def observe_scan(
-    agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, out
+    r, agents, scalars, edges, polygon_start, circles, dirs, inv_work, owner_work, hits, params, flags, out
 ):  # fmt: skip
-    """Fill out (n_rays,) float32 with the ranges from the robot's pose [m], and hits with the rays on each human."""
+    """Fill out (n_rays,) float32 with the ranges from robot r's pose [m], and hits with the rays on each agent."""
     n = int(scalars[S_HUMANS])
-    n_circles = fill_circles(agents, n, flags[F_LEGS] != 0, circles)
-    scan_world(
-        edges, polygon_start, int(scalars[S_POLYGONS]), circles, n_circles,
-        agents[0, A_X], agents[0, A_Y], agents[0, A_HEADING], dirs,
-        params[P_ANGLE_MIN], params[P_ANGLE_INCREMENT], params[P_RANGE_MAX], flags[F_GAP_QUIRK],
-        inv_work, owner_work, hits, out,
-    )  # fmt: skip
+    n_circles = fill_circles(r, agents, flags[F_ROBOTS], n, flags, circles)
+    if flags[F_ELLIPSE]:
+        scan_ellipses(
+            edges, polygon_start, int(scalars[S_POLYGONS]), circles, n_circles,
+            agents[r, A_X], agents[r, A_Y], agents[r, A_HEADING], dirs,
+            params[P_ANGLE_MIN], params[P_ANGLE_INCREMENT], params[P_RANGE_MAX],
+            inv_work, owner_work, hits, out,
+        )  # fmt: skip
+    else:
+        scan_world(
+            edges, polygon_start, int(scalars[S_POLYGONS]), circles, n_circles,
+            agents[r, A_X], agents[r, A_Y], agents[r, A_HEADING], dirs,
+            params[P_ANGLE_MIN], params[P_ANGLE_INCREMENT], params[P_RANGE_MAX], flags[F_GAP_QUIRK],
+            inv_work, owner_work, hits, out,
+        )  # fmt: skip
+    if flags[F_NOISE]:
+        disturb(scalars, r, params, out)
 
 
 @kernel
-def observe_state(agents, scalars, out):
-    """Fill out (5,) with goal x, goal y [m], vx, vy [m/s], omega [rad/s] in the robot frame."""
-    c, s = np.cos(agents[0, A_HEADING]), np.sin(agents[0, A_HEADING])
-    gx = agents[0, A_GX] - agents[0, A_X]
-    gy = agents[0, A_GY] - agents[0, A_Y]
+def observe_state(r, agents, flags, out):
+    """Fill out (5,) with goal x, goal y [m], vx, vy [m/s], omega [rad/s] in the frame of robot r."""
+    c, s = np.cos(agents[r, A_HEADING]), np.sin(agents[r, A_HEADING])
+    gx = agents[r, A_GX] - agents[r, A_X]
+    gy = agents[r, A_GY] - agents[r, A_Y]
     out[0] = c * gx + s * gy
     out[1] = c * gy - s * gx
-    out[2] = c * agents[0, A_VX] + s * agents[0, A_VY]
-    out[3] = c * agents[0, A_VY] - s * agents[0, A_VX]
-    out[4] = scalars[S_OMEGA]
+    out[2] = c * agents[r, A_VX] + s * agents[r, A_VY]
+    out[3] = c * agents[r, A_VY] - s * agents[r, A_VX]
+    out[4] = 0.0 if flags[F_HIDE_OMEGA] else agents[r, A_OMEGA]
 
 
 @kernel
-def observe_humans(agents, n_humans, hits, out):
-    """Fill out (H, 6): position and velocity along the robot's axes, radius, visible; NaN in empty slots."""
-    c, s = np.cos(agents[0, A_HEADING]), np.sin(agents[0, A_HEADING])
+def observe_humans(r, agents, n_robots, n_humans, hits, out):
+    """Fill out (H, 6): position and velocity along robot r's axes, radius, visible; NaN in empty slots.
+
+    The humans come first, then the other robots.
+    """
+    c, s = np.cos(agents[r, A_HEADING]), np.sin(agents[r, A_HEADING])
     for i in range(out.shape[0]):
-        if i < n_humans:
-            dx = agents[i + 1, A_X] - agents[0, A_X]
-            dy = agents[i + 1, A_Y] - agents[0, A_Y]
-            vx, vy = agents[i + 1, A_VX], agents[i + 1, A_VY]
+        if i < n_humans + n_robots - 1:
+            j = n_robots + i
+            if i >= n_humans:
+                j = i - n_humans
+                j += 1 if j >= r else 0
+            dx = agents[j, A_X] - agents[r, A_X]
+            dy = agents[j, A_Y] - agents[r, A_Y]
+            vx, vy = agents[j, A_VX], agents[j, A_VY]
             # rounded to about the scan's resolution: what lies below is noise that would not compress
             out[i, 0] = np.rint((c * dx + s * dy) * HUMANS_GRID) / HUMANS_GRID
             out[i, 1] = np.rint((c * dy - s * dx) * HUMANS_GRID) / HUMANS_GRID
             out[i, 2] = np.rint((c * vx + s * vy) * HUMANS_GRID) / HUMANS_GRID
             out[i, 3] = np.rint((c * vy - s * vx) * HUMANS_GRID) / HUMANS_GRID
-            out[i, 4] = agents[i + 1, A_RADIUS]
+            out[i, 4] = agents[j, A_RADIUS]
             out[i, 5] = 1.0 if hits[i] > 0 else 0.0
         else:
             out[i, :] = np.nan

@@ -18,7 +18,11 @@ from navrep_data.sim._layout import (
     A_VPREF,
     A_X,
     A_Y,
+    F_HUMAN_POLICY,
+    F_ROBOTS,
     F_SQUARE_CROSSING,
+    F_WORLD,
+    HUMANS_STATIC,
     P_BORDER_GAP,
     P_DANGER_DIST,
     P_HUMANS,
@@ -31,12 +35,15 @@ from navrep_data.sim._layout import (
     P_VPREF_LOW,
     P_WALLS,
     S_BORDER,
+    S_FEWER_HUMANS,
+    S_FEWER_OBSTACLES,
     S_HUMANS,
     S_POLYGONS,
     S_XMAX,
     S_XMIN,
     S_YMAX,
     S_YMIN,
+    WORLD_EMPTY,
 )
 from navrep_data.sim._rng import integer, uniform
 
@@ -68,13 +75,25 @@ def add_box(vertices, polygon_start, n, cx, cy, hx, hy, clockwise):
 
 
 @kernel
-def _place_obstacles(agents, vertices, polygon_start, boxes, rng, params):
-    """Draw squares and walls clear of the robot's start and goal; returns the number of polygons."""
+def _off_robots(agents, robots, cx, cy, hx, hy, danger):
+    """Return whether a box leaves room at the robots' starts and goals."""
+    for r in range(robots):
+        gap = agents[r, A_RADIUS] + danger
+        if (
+            box_distance(agents[r, A_X], agents[r, A_Y], cx, cy, hx, hy) <= gap
+            or box_distance(agents[r, A_GX], agents[r, A_GY], cx, cy, hx, hy) <= gap
+        ):
+            return False
+    return True
+
+
+@kernel
+def _place_obstacles(agents, robots, scalars, vertices, polygon_start, boxes, rng, params):
+    """Draw squares and walls clear of the robots' starts and goals; returns the number of polygons."""
     scale = params[P_POLYGON_SCALE]
     half = params[P_MAP_HALF]
-    n_squares = round(uniform(rng) * params[P_SQUARES])
-    n_walls = round(uniform(rng) * params[P_WALLS])
-    gap = agents[0, A_RADIUS] + params[P_DANGER_DIST]
+    n_squares = round(uniform(rng) * (params[P_SQUARES] - scalars[S_FEWER_OBSTACLES]))
+    n_walls = round(uniform(rng) * (params[P_WALLS] - scalars[S_FEWER_OBSTACLES]))
     n = 0
     for k in range(n_squares + n_walls):
         for _ in range(MAX_TRIES):
@@ -89,10 +108,7 @@ def _place_obstacles(agents, vertices, polygon_start, boxes, rng, params):
                 thick = 0.5 * WALL_THICKNESS * scale
                 hx = long if along_x else thick
                 hy = thick if along_x else long
-            if (
-                box_distance(agents[0, A_X], agents[0, A_Y], cx, cy, hx, hy) > gap
-                and box_distance(agents[0, A_GX], agents[0, A_GY], cx, cy, hx, hy) > gap
-            ):
+            if _off_robots(agents, robots, cx, cy, hx, hy, params[P_DANGER_DIST]):
                 boxes[n, 0], boxes[n, 1], boxes[n, 2], boxes[n, 3] = cx, cy, hx, hy
                 n = add_box(vertices, polygon_start, n, cx, cy, hx, hy, False)
                 break
@@ -113,11 +129,13 @@ def _fits(agents, n, i_x, i_y, x, y, radius, boxes, n_boxes, gap):
 
 
 @kernel
-def _place_humans(agents, boxes, n_boxes, rng, params, flags):
-    """Draw humans free of each other, the robot and all obstacles at start and goal; returns their number."""
-    wanted = min(round(params[P_HUMANS] * (0.5 + uniform(rng))), agents.shape[0] - 1)
+def _place_humans(agents, robots, scalars, boxes, n_boxes, rng, params, flags):
+    """Draw humans free of each other, the robots and all obstacles at start and goal; returns their number."""
+    humans = params[P_HUMANS] - scalars[S_FEWER_HUMANS]
+    wanted = min(round(humans * (0.5 + uniform(rng))), agents.shape[0] - robots)
     gap = params[P_DANGER_DIST]
-    n = 1
+    stand = flags[F_HUMAN_POLICY] == HUMANS_STATIC
+    n = robots
     for _k in range(wanted):
         v_pref = params[P_VPREF_LOW] + uniform(rng) * (params[P_VPREF_HIGH] - params[P_VPREF_LOW])
         radius = params[P_RADIUS_LOW] + uniform(rng) * (params[P_RADIUS_HIGH] - params[P_RADIUS_LOW])
@@ -141,25 +159,29 @@ def _place_humans(agents, boxes, n_boxes, rng, params, flags):
                 # the original also keeps starts off other agents' goals here, which thins out the ring
                 if not _fits(agents, n, A_GX, A_GY, x, y, radius, boxes, 0, gap):
                     continue
+            look_x, look_y = gx - x, gy - y
+            if stand:  # for good: off the robots' goals
+                gx, gy = x, y
+                if not _fits(agents, robots, A_GX, A_GY, x, y, radius, boxes, 0, gap):
+                    continue
             if _fits(agents, n, A_X, A_Y, x, y, radius, boxes, n_boxes, gap) and _fits(
                 agents, n, A_GX, A_GY, gx, gy, radius, boxes, n_boxes, gap
             ):
                 agents[n, :] = 0.0
                 agents[n, A_X], agents[n, A_Y] = x, y
                 agents[n, A_GX], agents[n, A_GY] = gx, gy
-                agents[n, A_HEADING] = np.arctan2(gy - y, gx - x) % (2.0 * np.pi)
+                agents[n, A_HEADING] = np.arctan2(look_y, look_x) % (2.0 * np.pi)
                 agents[n, A_RADIUS] = radius
                 agents[n, A_VPREF] = v_pref
                 agents[n, A_SEES] = 1.0 if sees else 0.0
                 n += 1
                 break
-    return n - 1
+    return n - robots
 
 
 @kernel
-def add_border(agents, scalars, vertices, polygon_start, n_polygons, gap):
+def add_border(agents, n_agents, scalars, vertices, polygon_start, n_polygons, gap):
     """Close the world by a box `gap` outside everything in it (navreptrainenv.py); returns the number of polygons."""
-    n_agents = int(scalars[S_HUMANS]) + 1
     xmin, xmax = np.inf, -np.inf
     ymin, ymax = np.inf, -np.inf
     for i in range(n_agents):
@@ -178,11 +200,38 @@ def add_border(agents, scalars, vertices, polygon_start, n_polygons, gap):
 
 
 @kernel
-def draw_world(agents, scalars, vertices, polygon_start, boxes, rng, params, flags):
-    """Draw a world: robot, obstacles, humans, border. Fills agents, scalars, vertices and polygon_start.
+def _place_robots(agents, robots, rng, params):
+    """Draw all robots but the first, on rings like its own; returns False where one finds no place."""
+    for n in range(1, robots):
+        agents[n, :] = 0.0
+        agents[n, A_VPREF] = params[P_VPREF_LOW] + uniform(rng) * (params[P_VPREF_HIGH] - params[P_VPREF_LOW])
+        radius = params[P_RADIUS_LOW] + uniform(rng) * (params[P_RADIUS_HIGH] - params[P_RADIUS_LOW])
+        agents[n, A_RADIUS] = radius
+        placed = False
+        for _ in range(MAX_TRIES):
+            angle = uniform(rng) * 2.0 * np.pi
+            ring = min(ROBOT_RADIUS_CAP, CIRCLE_RADIUS * (1.0 + 2.0 * uniform(rng)))
+            x, y = ring * np.cos(angle), ring * np.sin(angle)
+            if _fits(agents, n, A_X, A_Y, x, y, radius, agents, 0, params[P_DANGER_DIST]) and _fits(
+                agents, n, A_GX, A_GY, -x, -y, radius, agents, 0, params[P_DANGER_DIST]
+            ):
+                agents[n, A_X], agents[n, A_Y] = x, y
+                agents[n, A_GX], agents[n, A_GY] = -x, -y
+                placed = True
+                break
+        if not placed:
+            return False
+        agents[n, A_HEADING] = uniform(rng) * 2.0 * np.pi
+    return True
 
-    `boxes` is scratch of shape (polygons, 4).
+
+@kernel
+def draw_world(agents, scalars, vertices, polygon_start, boxes, rng, params, flags):
+    """Draw a world: robots, obstacles, humans, border; returns False where a robot has no place.
+
+    Fills agents, scalars, vertices and polygon_start. `boxes` is scratch of shape (polygons, 4).
     """
+    robots = flags[F_ROBOTS]
     agents[0, :] = 0.0
     robot_v = params[P_VPREF_LOW] + uniform(rng) * (params[P_VPREF_HIGH] - params[P_VPREF_LOW])
     robot_r = params[P_RADIUS_LOW] + uniform(rng) * (params[P_RADIUS_HIGH] - params[P_RADIUS_LOW])
@@ -192,8 +241,15 @@ def draw_world(agents, scalars, vertices, polygon_start, boxes, rng, params, fla
     agents[0, A_HEADING] = uniform(rng) * 2.0 * np.pi
     agents[0, A_RADIUS] = robot_r
     agents[0, A_VPREF] = robot_v
+    if not _place_robots(agents, robots, rng, params):
+        return False
     polygon_start[0] = 0
-    n_polygons = _place_obstacles(agents, vertices, polygon_start, boxes, rng, params)
-    scalars[S_HUMANS] = _place_humans(agents, boxes, n_polygons, rng, params, flags)
-    n_polygons = add_border(agents, scalars, vertices, polygon_start, n_polygons, params[P_BORDER_GAP])
+    n_polygons = _place_obstacles(agents, robots, scalars, vertices, polygon_start, boxes, rng, params)
+    n_humans = _place_humans(agents, robots, scalars, boxes, n_polygons, rng, params, flags)
+    scalars[S_HUMANS] = n_humans
+    if flags[F_WORLD] != WORLD_EMPTY:
+        n_polygons = add_border(
+            agents, robots + n_humans, scalars, vertices, polygon_start, n_polygons, params[P_BORDER_GAP]
+        )
     scalars[S_POLYGONS] = n_polygons
+    return True

@@ -15,8 +15,8 @@ _ENVIRONMENTS: dict[str, tuple[str, dict[str, Any]]] = {
         {"crossing": "circle", "humans": 20, "obstacles": 10, "polygon_scale": 1.25},
     ),
     "navrep-train": (
-        "the training environment at its greatest difficulty: procedural polygons, about 5 ORCA humans on a circle",
-        {"crossing": "circle", "humans": 5, "obstacles": 10, "polygon_scale": 1.25},
+        "the training environment: procedural polygons, about 5 ORCA humans on a circle, adaptive curriculum",
+        {"crossing": "circle", "humans": 5, "obstacles": 10, "polygon_scale": 1.25, "curriculum": "adaptive"},
     ),
     "navrep-val": (
         "as navrep-train, with 50 numbered episodes",
@@ -26,7 +26,19 @@ _ENVIRONMENTS: dict[str, tuple[str, dict[str, Any]]] = {
         "the training environment's test: humans cross a square, polygons at true size, 500 numbered episodes",
         {"crossing": "square", "humans": 5, "obstacles": 10, "polygon_scale": 1.0},
     ),
+    "cadrl": (
+        "humans only: about 10 ORCA humans on a circle, seen as trunks; nothing static, no border",
+        {"world": "empty", "crossing": "circle", "humans": 10, "obstacles": 0, "rendering": "trunk"},
+    ),
+    "empty": (
+        "the robot alone with its goal: nothing static, nobody else",
+        {"world": "empty", "humans": 0, "obstacles": 0},
+    ),
 }
+
+# gymnasium's ids are CamelCase with a version; these words are spelled otherwise than by capitals alone
+_SPELLED = {"navrep": "NavRep", "soadrl": "SOADRL", "cadrl": "CADRL", "ian": "IAN", "crowdmove": "CrowdMove"}
+_GYMNASIUM_VERSION = 0
 
 # crowd_sim.py: numpy is seeded with an offset plus the case counter, which wraps at the phase's size
 _NUMBERED: dict[str, tuple[int, int]] = {"navrep-val": (0, 50), "navrep-test": (1000, 500)}
@@ -66,6 +78,23 @@ def numpy_seed(env: str, episode: int) -> int:
         raise ConfigError(f"episode is {episode!r}, expected a whole number from 0.")
     first, count = _NUMBERED[env]
     return first + int(episode) % count
+
+
+def gymnasium_id(name: str) -> str:
+    """Return the gymnasium id of an environment: ``navrep-train`` -> ``NavRepTrain-v0``.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such environment.
+    """
+    _lookup(name)
+    return f"{camel_case(name)}-v{_GYMNASIUM_VERSION}"
+
+
+def camel_case(name: str) -> str:
+    """Return a kebab-case name in CamelCase, as gymnasium spells ids: ``mark-train-1`` -> ``MarkTrain1``."""
+    return "".join(_SPELLED.get(word, word.capitalize()) for word in name.split("-"))
 
 
 def _lookup(name: str) -> tuple[str, dict[str, Any]]:

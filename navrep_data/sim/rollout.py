@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from navrep_data.errors import PolicyError, SimulationError
+from navrep_data.errors import ConfigError, PolicyError, SimulationError
 from navrep_data.observations import scan_to_rings
 from navrep_data.schema import ACTION_SIZE, HUMAN_FIELDS, RINGS_SHAPE, Event
 from navrep_data.sim import _layout as lay
@@ -52,7 +52,7 @@ class _Outputs:
     """Room for the rows of a batch of sequences; reused from batch to batch."""
 
     def __init__(self, config: SimConfig, settings: RolloutSettings, n: int) -> None:
-        length, crowd = settings.length, config.max_humans
+        length, crowd = settings.length, config.max_others
         # every row may start an episode (a policy can give up at once), so tables grow only up to this
         starts = length
         self.scan = np.zeros((n, length, config.sensor.n_rays), settings.scan_dtype)
@@ -136,7 +136,8 @@ class ScriptedRollout:
     settings : RolloutSettings
         Length and columns.
     policy : ScriptedPolicy
-        The robot's policy.
+        The robot's policy. Where there are several robots it drives them all; rows are those of the first, and the
+        others are listed after the humans.
     seed : int
         The dataset's seed; sequence i draws from the stream (seed, i) alone.
     """
@@ -189,6 +190,11 @@ class CallableRollout:
     def __init__(
         self, config: SimConfig, settings: RolloutSettings, policy: PolicyFunction, seed: int, batch: int = 64
     ) -> None:
+        if config.robots > 1:
+            raise ConfigError(
+                f"robots={config.robots} with a Python policy: it drives one robot; set robots=1, or take a scripted "
+                f"policy, which drives all ({', '.join(SCRIPTED)})."
+            )
         self.config = config
         self.settings = settings
         self.policy = policy

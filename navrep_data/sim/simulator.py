@@ -13,7 +13,9 @@ from navrep_data.errors import ConfigError, SimulationError
 from navrep_data.schema import ACTION_SIZE, HUMAN_FIELDS, ROBOT_STATE_SIZE, Event
 from navrep_data.sim import _batch, _step
 from navrep_data.sim import _layout as lay
+from navrep_data.sim._ellipse import ELLIPSE_COLUMNS
 from navrep_data.sim._geometry import swept_clearance
+from navrep_data.sim._lidar import CIRCLE_COLUMNS
 from navrep_data.sim._obstacles import OF_FIELDS, OI_FIELDS
 from navrep_data.sim._orca import make_orca_work
 from navrep_data.sim.config import SimConfig, kernel_flags, kernel_params, orca_params
@@ -45,7 +47,10 @@ class WorldArrays:
     """The packed state of a batch of worlds and the scratch space of the kernels; see ``_layout`` for the columns."""
 
     def __init__(self, config: SimConfig, n_worlds: int) -> None:
-        agents = config.max_humans + 1
+        if config.world == "map":
+            raise ConfigError("world='map' cannot be simulated by this version; set world='polygons' or 'empty'.")
+        robots = config.robots
+        agents = config.max_humans + robots
         polygons = config.max_polygons
         corners = 4 * polygons
         rays = config.sensor.n_rays
@@ -67,14 +72,15 @@ class WorldArrays:
         self.obst_f = np.zeros((n, trees, OF_FIELDS, lay.MAX_OBSTACLE_EDGES), np.float32)
         self.obst_i = np.zeros((n, trees, OI_FIELDS, lay.MAX_OBSTACLE_EDGES), np.int32)
         self.rng = np.zeros((n, lay.RNG_WORDS), np.uint64)
-        self.hits = np.zeros((n, max(1, config.max_humans)), np.int32)
-        self.scans = np.zeros((n, rays), np.float32)
+        # per world and robot
+        self.hits = np.zeros((n * robots, max(1, config.max_others)), np.int32)
+        self.scans = np.zeros((n * robots, rays), np.float32)
         # scratch, shared by all worlds
         self.agents32 = np.zeros((agents, 6), np.float32)
-        self.circles = np.zeros((2 * agents, 4))
+        self.circles = np.zeros((2 * agents, ELLIPSE_COLUMNS if config.rendering == "ellipse" else CIRCLE_COLUMNS))
         self.inv_work = np.zeros(rays)
         self.owner_work = np.zeros(rays, np.int32)
-        self.moves = np.zeros((agents, 2))
+        self.moves = np.zeros((agents, 3))
         self.work_f, self.work_i = make_orca_work(lay.MAX_OBSTACLE_EDGES, agents)
 
 
@@ -85,15 +91,20 @@ class WorldState:
     Attributes
     ----------
     robot : ndarray of shape (7,)
-        x, y [m], theta [rad], goal x, goal y [m], radius [m], preferred speed [m/s].
+        x, y [m], theta [rad], goal x, goal y [m], radius [m], preferred speed [m/s]; of the first robot.
     humans : ndarray of shape (n, 10)
         x, y [m], vx, vy [m/s], theta [rad], goal x, goal y [m], radius [m], preferred speed [m/s], sees the robot.
     polygons : list of ndarray of shape (k, 2)
         Corners [m]; anticlockwise = solid inside, clockwise = border (solid outside).
     circles : ndarray of shape (m, 3)
-        What the lidar sees of the humans: x, y, radius [m].
+        What the lidar sees of the humans: x, y, radius [m]. With ``rendering="ellipse"`` the larger semi-axis.
     step : int
         Steps since reset.
+    robots : ndarray of shape (R, 7)
+        All robots, as `robot`.
+    ellipses : ndarray of shape (m, 5)
+        With ``rendering="ellipse"`` what the lidar sees of the humans: x, y [m], semi-axes along and across the
+        heading [m], heading [rad]; otherwise no rows.
     """
 
     robot: F64
@@ -101,6 +112,8 @@ class WorldState:
     polygons: list[F64]
     circles: F64
     step: int
+    robots: F64
+    ellipses: F64
 
 
 class Simulator:
@@ -125,7 +138,11 @@ class Simulator:
     Notes
     -----
     Worlds do not end by themselves: :meth:`step` reports events, the caller resets. An action is the body velocity
-    command (vx, vy [m/s], omega [rad/s]) and is executed as given.
+    command (vx, vy [m/s], omega [rad/s]) and is executed as given, but for what `drive` and `inertia` say.
+
+    With several robots, arrays per robot have an axis of R robots after that of the W worlds. The episode is joint:
+    one event per world, the highest ranking of its robots' (collision with an agent, with an obstacle, goal, timeout);
+    a collision between robots counts as ``collision_human``, the code for collisions with agents.
     """
 
     def __init__(self, config: SimConfig, n_worlds: int = 1, seed: int = 0, first_sequence: int = 0) -> None:
@@ -158,10 +175,15 @@ class Simulator:
         Raises
         ------
         ConfigError
-            If a shape or a seed is wrong.
+            If a shape or a seed is wrong, or the curriculum is adaptive.
         SimulationError
             If a world could not be drawn.
         """
+        if self.config.curriculum == "adaptive":
+            raise ConfigError(
+                "curriculum='adaptive' cannot play numbered episodes: a world would depend on those before it; set "
+                "curriculum='constant'."
+            )
         chosen = self._mask(mask)
         seeds = np.asarray(numpy_seeds)
         if seeds.shape != (self.n_worlds,) or seeds.dtype.kind not in "iu":
@@ -173,6 +195,35 @@ class Simulator:
         streams = np.zeros_like(self.arrays.rng)
         _batch.seed_legacy(streams, np.where(chosen, seeds, 0).astype(np.uint64), chosen)
         self._reset(chosen, streams)
+
+    def restart(self, seeds: ArrayLike, mask: ArrayLike | None = None) -> None:
+        """Give worlds new streams, forget their episodes, and start the first one.
+
+        A world restarted with a seed goes on like the only world of ``Simulator(config, seed=seed)``.
+
+        Parameters
+        ----------
+        seeds : array_like of shape (W,)
+            Whole numbers from 0 to 2^63 - 1; those outside `mask` are not used.
+        mask : array_like of shape (W,), optional
+            Which worlds; all by default.
+
+        Raises
+        ------
+        ConfigError
+            If a shape or a seed is wrong.
+        """
+        chosen = self._mask(mask)
+        values = np.asarray(seeds)
+        if values.shape != (self.n_worlds,) or values.dtype.kind not in "iu":
+            raise ConfigError(
+                f"seeds have shape {values.shape}, dtype {values.dtype}, expected ({self.n_worlds},) whole numbers."
+            )
+        for seed in values[chosen].tolist():
+            check_seed(seed)
+        streams = np.where(chosen, values, 0).astype(np.uint64)
+        _batch.reseed_worlds(self.arrays.rng, self.arrays.scalars, streams, chosen)
+        self._reset(chosen, self.arrays.rng)
 
     def _mask(self, mask: ArrayLike | None) -> NDArray[np.bool_]:
         chosen = np.ones(self.n_worlds, np.bool_) if mask is None else np.asarray(mask, np.bool_)
@@ -194,52 +245,74 @@ class Simulator:
         Parameters
         ----------
         actions : array_like of shape (W, 3)
-            Body velocity commands: vx, vy [m/s], omega [rad/s].
+            Body velocity commands: vx, vy [m/s], omega [rad/s]. With R > 1 robots: (W, R, 3).
 
         Returns
         -------
         rewards : ndarray of shape (W,)
-            Reward of this step.
+            Reward of this step. With R > 1 robots: (W, R).
         events : ndarray of shape (W,), uint8
             :class:`navrep_data.schema.Event` codes; 0 = the episode goes on.
         """
         a = self.arrays
         commands = np.ascontiguousarray(actions, np.float64)
-        if commands.shape != (self.n_worlds, ACTION_SIZE):
-            raise ConfigError(f"actions have shape {commands.shape}, expected ({self.n_worlds}, {ACTION_SIZE}).")
+        expected = (self.n_worlds, *self._per_robot, ACTION_SIZE)
+        if commands.shape != expected:
+            raise ConfigError(f"actions have shape {commands.shape}, expected {expected}.")
         if not np.isfinite(commands).all():
             raise ConfigError("actions hold NaN or infinity, expected finite velocities.")
-        rewards = np.zeros(self.n_worlds)
+        rewards = np.zeros((self.n_worlds, self.config.robots))
         events = np.zeros(self.n_worlds, np.uint8)
         _batch.step_worlds(
-            commands, a.agents, a.agents32, a.scalars, a.edges, a.polygon_start, a.boxes, a.obst_f, a.obst_i, a.params,
-            a.flags, a.orca_params, a.work_f, a.work_i, a.moves, rewards, events,
+            commands.reshape(self.n_worlds, -1), a.agents, a.agents32, a.scalars, a.edges, a.polygon_start, a.boxes,
+            a.obst_f, a.obst_i, a.params, a.flags, a.orca_params, a.work_f, a.work_i, a.moves, rewards, events,
         )  # fmt: skip
-        return rewards, events
+        return rewards.reshape(self.n_worlds, *self._per_robot), events
+
+    @property
+    def _per_robot(self) -> tuple[int, ...]:
+        """The axis of robots, where there is one."""
+        return (self.config.robots,) if self.config.robots > 1 else ()
 
     def observe(self) -> tuple[F32, F32]:
         """Return scans (W, n_rays) [m] and robot states (W, 5), both float32, of the present state.
 
-        Robot state: goal x, goal y [m], vx, vy [m/s], omega [rad/s] in the robot frame.
+        Robot state: goal x, goal y [m], vx, vy [m/s], omega [rad/s] in the robot frame. With R > 1 robots:
+        (W, R, n_rays) and (W, R, 5).
         """
         a = self.arrays
-        states = np.zeros((self.n_worlds, ROBOT_STATE_SIZE), np.float32)
+        per_robot = (self.n_worlds, *self._per_robot)
+        states = np.zeros((self.n_worlds * self.config.robots, ROBOT_STATE_SIZE), np.float32)
         _batch.observe_worlds(
             a.agents, a.scalars, a.edges, a.polygon_start, a.circles, a.dirs, a.inv_work, a.owner_work, a.hits,
             a.params, a.flags, a.scans, states,
         )  # fmt: skip
-        return a.scans.copy(), states
+        return a.scans.copy().reshape(*per_robot, -1), states.reshape(*per_robot, ROBOT_STATE_SIZE)
 
     def humans(self) -> F32:
-        """Return what the `humans` column would hold now: (W, max_humans, 6) float32, NaN-padded.
+        """Return what the `humans` column would hold now: (W, max_others, 6) float32, NaN-padded.
 
-        `visible` is that of the last :meth:`observe`.
+        `visible` is that of the last :meth:`observe`. With R > 1 robots: (W, R, max_others, 6), the other robots after
+        the humans.
         """
         a = self.arrays
-        out = np.zeros((self.n_worlds, self.config.max_humans, len(HUMAN_FIELDS)), np.float32)
-        for w in range(self.n_worlds):
-            _step.observe_humans(a.agents[w], int(a.scalars[w, lay.S_HUMANS]), a.hits[w], out[w])
-        return out
+        out = np.zeros((self.n_worlds * self.config.robots, self.config.max_others, len(HUMAN_FIELDS)), np.float32)
+        _batch.observe_others(a.agents, a.scalars, a.hits, a.flags, out)
+        return out.reshape(self.n_worlds, *self._per_robot, *out.shape[1:])
+
+    def robot_events(self) -> NDArray[np.uint8]:
+        """Return what the last step led to for each robot, (W, R) uint8 event codes."""
+        return self.arrays.agents[:, : self.config.robots, lay.A_EVENT].astype(np.uint8)
+
+    def damage(self) -> F64:
+        """Return the damage that each robot has taken since reset, (W, R) [m/s]; 0 unless ``on_collision="damage"``."""
+        return self.arrays.agents[:, : self.config.robots, lay.A_DAMAGE].copy()
+
+    def difficulty(self) -> NDArray[np.int64]:
+        """Return the present setting of `humans` and `obstacles` in each world, (W, 2): what the curriculum adapts."""
+        most = np.array([self.config.humans, self.config.obstacles])
+        fewer: NDArray[np.int64] = self.arrays.scalars[:, [lay.S_FEWER_HUMANS, lay.S_FEWER_OBSTACLES]].astype(np.int64)
+        return most - fewer
 
     def clearance(self, points: ArrayLike, world: int = 0) -> F64:
         """Return how far points (N, 2) are from solid static matter [m], world frame; negative inside it.
@@ -256,7 +329,7 @@ class Simulator:
     def state(self, world: int = 0) -> WorldState:
         """Return a copy of one world's state."""
         a = self.arrays
-        n = int(a.scalars[world, lay.S_HUMANS])
+        robots, n = self.config.robots, int(a.scalars[world, lay.S_HUMANS])
         agents = a.agents[world]
         columns = [lay.A_X, lay.A_Y, lay.A_HEADING, lay.A_GX, lay.A_GY, lay.A_RADIUS, lay.A_VPREF]
         human_columns = [
@@ -264,13 +337,17 @@ class Simulator:
             lay.A_SEES,
         ]  # fmt: skip
         starts = a.polygon_start[world, : int(a.scalars[world, lay.S_POLYGONS]) + 1]
-        count = _step.fill_circles(agents, n, a.flags[lay.F_LEGS] != 0, a.circles)
+        count = _step.fill_circles(-1, agents, robots, n, a.flags, a.circles)
+        bodies = a.circles[: count if self.config.rendering == "ellipse" else 0]
+        heading = np.arctan2(bodies[:, -1], bodies[:, -2])
         return WorldState(
             robot=agents[0, columns].copy(),
-            humans=agents[1 : n + 1, human_columns].copy(),
+            humans=agents[robots : robots + n, human_columns].copy(),
             polygons=[a.vertices[world, i:j].copy() for i, j in pairwise(starts)],
             circles=a.circles[:count, :3].copy(),
             step=int(a.scalars[world, lay.S_STEP]),
+            robots=agents[:robots][:, columns].copy(),
+            ellipses=np.column_stack([bodies[:, :2], bodies[:, -3], bodies[:, 2], heading]),
         )
 
     def describe_event(self, code: int) -> str:
