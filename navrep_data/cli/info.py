@@ -25,12 +25,21 @@ def info_command(
 
 
 def _print_info(root: Path, found: dict[str, Any]) -> None:
-    state = "complete" if found["complete"] else f"unfinished: {found['sequences']} of {found['planned']} sequences"
+    whole = found["partial"]
+    if whole is not None:
+        state = f"partial: {found['shards']} of {whole['shards']} shards, {found['sequences']} of {whole['sequences']}"
+        state += " sequences"
+    else:
+        state = "complete" if found["complete"] else f"unfinished: {found['sequences']} of {found['planned']} sequences"
     say(f"{root}: {found['env']}, {found['physics']} physics, seed {found['seed']} ({state})")
     say(
         f"{found['sequences']:,} sequences, {found['rows']:,} rows in {found['shards']} shards, "
         f"{found['bytes'] / 1e6:,.1f} MB ({found['bytes_per_row'] / 1e3:.2f} kB/row)"
     )
+    origin = found["origin"]
+    if origin is not None:
+        say(f"from: {origin['repo']} at commit {origin['commit']} ({origin['endpoint']})")
+    say(f"content: {found['content_hash']}" + (f", licence {found['license']}" if found["license"] else ""))
     say("splits: " + ", ".join(f"{name} {count}" for name, count in found["splits"].items()))
     say("columns: " + ", ".join(found["columns"]))
     episodes = max(1, sum(o["episodes"] for o in found["outcomes"].values()))

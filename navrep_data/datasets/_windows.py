@@ -201,6 +201,11 @@ class WindowDataset(Dataset[Batch]):
         }
         return {name: int(values[index]) for name, values in names.items()}
 
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What a checkpoint records of the dataset it was trained on, see :func:`navrep_data.shards.dataset_record`."""
+        return self._folder.provenance
+
     def close(self) -> None:
         """Close the open files; the next access opens them again."""
         self._folder.close()

@@ -174,6 +174,11 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         first, stop = _share(0, len(self.table), self.rank, self.world_size)
         return stop - first
 
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What a checkpoint records of the dataset it was trained on, see :func:`navrep_data.shards.dataset_record`."""
+        return self._folder.provenance
+
     def close(self) -> None:
         """Close the open files; the next access opens them again."""
         self._folder.close()

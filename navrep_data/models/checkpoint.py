@@ -33,6 +33,8 @@ from navrep_data.models.modular import MDNRNN, ModularWorldModel
 from navrep_data.models.transformer import TransformerWorldModel
 from navrep_data.models.vae import VAE
 
+DATASET_FIELDS = ("name", "repo", "revision", "content_hash")
+"""What the record of a dataset holds at least: its name, Hub repository and commit (or None), hash over its rows."""
 FORMAT_NAME = "navrep-data-model"
 FORMAT_VERSION = 1
 WEIGHTS_NAME, CONFIG_NAME = "model.safetensors", "config.json"
@@ -86,7 +88,13 @@ def paths(path: Path | str) -> tuple[Path, Path]:
     return folder / WEIGHTS_NAME, folder / CONFIG_NAME
 
 
-def save(module: nn.Module, path: Path | str, metadata: Mapping[str, Any] | None = None) -> Path:
+def save(
+    module: nn.Module,
+    path: Path | str,
+    metadata: Mapping[str, Any] | None = None,
+    *,
+    dataset: Mapping[str, Any] | None = None,
+) -> Path:
     """Write a network as safetensors and JSON; the config comes last, so a checkpoint with one is complete.
 
     Parameters
@@ -97,6 +105,10 @@ def save(module: nn.Module, path: Path | str, metadata: Mapping[str, Any] | None
         Folder (made if missing) or ``FILE.safetensors``.
     metadata : mapping, optional
         Plain JSON values to keep beside the config: provenance, results.
+    dataset : mapping, optional
+        What it was trained on, kept as ``metadata["dataset"]``: the ``provenance`` of a dataset of
+        :mod:`navrep_data.datasets`, or :func:`navrep_data.shards.dataset_record` of a folder, with more keys (split) if
+        you like. It says which rows, by content hash, and where they came from, by repository and commit.
 
     Returns
     -------
@@ -107,7 +119,18 @@ def save(module: nn.Module, path: Path | str, metadata: Mapping[str, Any] | None
     ------
     CheckpointError
         If the module is not a network of this package or holds NaN or infinity.
+    ConfigError
+        If `dataset` lacks what identifies a dataset.
     """
+    kept = dict(metadata or {})
+    if dataset is not None:
+        missing = [name for name in DATASET_FIELDS if name not in dataset]
+        if missing:
+            raise ConfigError(
+                f"The dataset record lacks {', '.join(missing)}; expected the provenance of a dataset, as "
+                "SequenceDataset(...).provenance gives it."
+            )
+        kept["dataset"] = dict(dataset)
     config = getattr(module, "config", None)
     if not isinstance(config, ModelConfig) or config.kind not in _KINDS:
         raise CheckpointError(
@@ -127,7 +150,7 @@ def save(module: nn.Module, path: Path | str, metadata: Mapping[str, Any] | None
             "kind": config.kind,
             "config": config.to_dict(),
             "weights_sha256": sha256_bytes(weights),
-            "metadata": dict(metadata or {}),
+            "metadata": kept,
         },
     )
     return weights_path

@@ -2,6 +2,7 @@
 
 from navrep_data.shards._layout import chunk_rows, column_order, estimate_bytes
 from navrep_data.shards.card import dataset_card
+from navrep_data.shards.content import choose_shards, content_hash, select_shards
 from navrep_data.shards.entries import (
     SPLIT_RULE,
     SPLITS,
@@ -12,9 +13,10 @@ from navrep_data.shards.entries import (
     split_of,
     worlds_file,
 )
-from navrep_data.shards.folder import DatasetFolder, Episodes, info
+from navrep_data.shards.folder import DatasetFolder, Episodes, dataset_record, info
 from navrep_data.shards.lock import LOCK_FILE, writer_lock
 from navrep_data.shards.manifest import CARD_FILE, MANIFEST_FILE, Manifest
+from navrep_data.shards.origin import ORIGIN_FILE, REPO_NAME, Origin, read_origin
 from navrep_data.shards.reader import Shard
 from navrep_data.shards.recipe import ShardRecipe, read_recipe
 from navrep_data.shards.statistics import merge_statistics
@@ -27,6 +29,8 @@ __all__ = [
     "LOCK_FILE",
     "MANIFEST_FILE",
     "MAX_SHARD_BYTES",
+    "ORIGIN_FILE",
+    "REPO_NAME",
     "SPLITS",
     "SPLIT_RULE",
     "WORLD_FIELDS",
@@ -35,6 +39,7 @@ __all__ = [
     "Episodes",
     "FileEntry",
     "Manifest",
+    "Origin",
     "Problem",
     "Shard",
     "ShardEntry",
@@ -43,16 +48,21 @@ __all__ = [
     "ShardWriter",
     "VerifyReport",
     "Worlds",
+    "choose_shards",
     "chunk_rows",
     "column_order",
+    "content_hash",
     "dataset_card",
+    "dataset_record",
     "default_splits",
     "estimate_bytes",
     "info",
     "merge_statistics",
     "publish",
+    "read_origin",
     "read_recipe",
     "read_worlds",
+    "select_shards",
     "sequence_hash",
     "shard_file",
     "split_of",

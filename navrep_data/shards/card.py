@@ -10,6 +10,9 @@ from navrep_data.shards._layout import VECTOR_COLUMNS, Layout, layouts
 from navrep_data.shards.entries import SPLITS
 from navrep_data.shards.manifest import Manifest
 
+# Beyond this many files one pattern names them all, in one split.
+_MAX_LISTED = 1000
+
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 _SIZES_LARGE = ((10_000_000, "1M<n<10M"), (100_000_000, "10M<n<100M"), (1_000_000_000, "100M<n<1B"))
 
@@ -27,10 +30,32 @@ def _size_category(rows: int) -> str:
     return next((name for limit, name in (*_SIZES, *_SIZES_LARGE) if rows < limit), "n>1B")
 
 
+def _data_files(m: Manifest) -> list[str]:
+    """Return the shards by split where each belongs to one; else all of them as one split."""
+    by_split: dict[str, list[str]] = {name: [] for name in SPLITS}
+    for shard in m.shards:
+        held = {m.split_of(k) for k in range(*shard.sequences)}
+        if len(held) != 1 or None in held or len(m.shards) > _MAX_LISTED:
+            return ["  - split: train", '    path: "data/*.h5"']
+        by_split[str(held.pop())].append(shard.file)
+    lines = []
+    for name, files in by_split.items():
+        if files:
+            lines += [f"  - split: {name}", "    path:", *(f'    - "{file}"' for file in files)]
+    return lines
+
+
+def split_note(m: Manifest) -> str:
+    """Say what the Hub's viewer, which knows files only, shows of the splits."""
+    if len(_data_files(m)) == 2:
+        return "Shards hold sequences of several splits, so the Hub's viewer shows all of them as one."
+    return "Each shard belongs to one split, and the Hub's viewer shows them so."
+
+
 def _front_matter(m: Manifest) -> str:
     lines = [
         "---",
-        "license: mit",
+        *([f"license: {m.license}"] if m.license else []),
         f"pretty_name: {json.dumps(f'navrep-data {m.env} ({m.physics} physics, seed {m.seed})')}",
         "task_categories:",
         "- reinforcement-learning",
@@ -42,8 +67,7 @@ def _front_matter(m: Manifest) -> str:
         "configs:",
         "- config_name: default",
         "  data_files:",
-        "  - split: train",
-        '    path: "data/*.h5"',
+        *_data_files(m),
         "---",
     ]
     return "\n".join(lines)
@@ -99,6 +123,31 @@ def _outcomes_table(statistics: dict[str, Any]) -> str:
     return _table(("event", "episodes", "share", "mean steps", "min", "max"), rows)
 
 
+def _pictures(m: Manifest) -> str:
+    """Return the lines that show the pictures of a published dataset."""
+    words = {".gif": "An episode: the robot (red) among people (blue), what its lidar sees (yellow), and its rings.",
+             ".png": "A world, its scan and its rings."}  # fmt: skip
+    lines = []
+    for entry in m.extras:
+        suffix = entry.file[entry.file.rfind(".") :]
+        if suffix in words:
+            lines += [f"![{words[suffix]}]({entry.file})", "", f"*{words[suffix]} Drawn from the data.*", ""]
+    return "\n".join([*lines, ""]) if lines else ""
+
+
+def _lead(m: Manifest) -> str:
+    return _part(m) + _pictures(m)
+
+
+def _part(m: Manifest) -> str:
+    if m.partial is None:
+        return ""
+    return (
+        f"**This copy is a part**: {len(m.shards):,} of {m.partial['shards']:,} shards, "
+        f"{m.sequences:,} of {m.partial['sequences']:,} sequences.\n\n"
+    )
+
+
 def _limits(m: Manifest) -> str:
     lines = ["* Simulated: flat ground, a planar lidar without noise, humans that follow ORCA."]
     if m.scan_dtype == "uint16":
@@ -143,7 +192,7 @@ def dataset_card(manifest: Manifest) -> str:
 
 # navrep-data: {m.env}
 
-{m.rows:,} steps of a robot among humans, in {m.sequences:,} sequences of {m.length:,} steps: lidar
+{_lead(m)}{m.rows:,} steps of a robot among humans, in {m.sequences:,} sequences of {m.length:,} steps: lidar
 scans, robot states, actions, rewards and the crowd behind them.
 Environment `{m.env}`, `{m.physics}` physics, seed {m.seed}.
 {len(m.shards):,} HDF5 shards, {m.bytes:,} bytes ({m.bytes / max(m.rows, 1):,.0f} per step).
@@ -180,7 +229,7 @@ anticlockwise; up to {m.sensor.range_max:g} m; one step is {m.sensor.dt:g} s.
 ## Splits
 
 By sequence ({m.split_rule}); ranges are in `manifest.json`.
-The Hub's viewer shows all sequences as one split.
+{split_note(m)}
 
 {_table(("split", "sequences"), splits)}
 

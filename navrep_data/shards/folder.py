@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,10 @@ import numpy.typing as npt
 
 from navrep_data.errors import ConfigError, CorruptDataError, did_you_mean
 from navrep_data.io import safe_join
-from navrep_data.shards.entries import SPLITS
+from navrep_data.shards.content import content_hash
+from navrep_data.shards.entries import SPLITS, ShardEntry
 from navrep_data.shards.manifest import Manifest
+from navrep_data.shards.origin import Origin, read_origin
 from navrep_data.shards.reader import Shard
 from navrep_data.shards.worlds import Worlds, read_worlds
 
@@ -25,6 +28,8 @@ columns, about 70 bytes per row. Opening one costs milliseconds, so random acces
 open."""
 
 Ints = npt.NDArray[np.int64]
+ShardIndex = tuple[Ints, Ints, Ints, npt.NDArray[np.uint8]]
+"""Of the episodes of one shard: sequence, episode, first row, event."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +85,17 @@ class DatasetFolder:
         Dataset folder.
     max_open : int
         Shards kept open at a time.
+    manifest : Manifest, optional
+        Instead of the one in the folder: with some of its shards only.
+    origin : Origin, optional
+        Where it came from; by default as written in the folder.
 
     Attributes
     ----------
     manifest : Manifest
         Its checked manifest.
+    origin : Origin or None
+        The Hub repository and commit it came from, if it did.
 
     Raises
     ------
@@ -96,9 +107,17 @@ class DatasetFolder:
     Can be pickled and forked: shards are opened again on demand.
     """
 
-    def __init__(self, root: Path | str, *, max_open: int = MAX_OPEN_SHARDS) -> None:
+    def __init__(
+        self,
+        root: Path | str,
+        *,
+        max_open: int = MAX_OPEN_SHARDS,
+        manifest: Manifest | None = None,
+        origin: Origin | None = None,
+    ) -> None:
         self.root = Path(root)
-        self.manifest = Manifest.read(self.root)
+        self.manifest = Manifest.read(self.root) if manifest is None else manifest
+        self.origin = read_origin(self.root) if origin is None else origin
         self._max_open = max(1, max_open)
         self._open: OrderedDict[int, Shard] = OrderedDict()
         self._lock, self._pid = threading.Lock(), os.getpid()
@@ -132,8 +151,7 @@ class DatasetFolder:
             if shard is not None:
                 self._open.move_to_end(index)
                 return shard
-        entry = self.manifest.shards[index]
-        shard = Shard(safe_join(self.root, entry.file), entry)
+        shard = self._open_shard(self.manifest.shards[index])
         manifest = self.manifest
         if tuple(shard.columns) != manifest.columns or shard.sensor != manifest.sensor:
             raise CorruptDataError(
@@ -147,6 +165,18 @@ class DatasetFolder:
             while len(self._open) > self._max_open:
                 self._open.popitem(last=False)
         return shard
+
+    def _open_shard(self, entry: ShardEntry) -> Shard:
+        """Open a shard of the manifest; where shards are fetched on demand, this is where."""
+        return Shard(safe_join(self.root, entry.file), entry)
+
+    def expect(self, shards: Iterable[int]) -> None:
+        """Take note of which shards will be read next, in this order; folders that fetch on demand use it."""
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What a checkpoint records of the dataset it was trained on: see :func:`dataset_record`."""
+        return dataset_record(self)
 
     def read(self, column: str, shard: int, start: int, stop: int) -> npt.NDArray[Any]:
         """Return rows [start, stop) of `column` in shard `shard`; see :meth:`Shard.read`."""
@@ -164,37 +194,71 @@ class DatasetFolder:
             self._episodes = self._index()
         return self._episodes
 
-    def _index(self) -> Episodes:
-        parts: list[list[npt.NDArray[Any]]] = []
-        for k in range(len(self.manifest.shards)):
-            shard = self.shard(k)
-            first = np.flatnonzero(shard.read("is_first", 0, shard.rows))
-            if not len(first) or first[0] != 0:
-                raise CorruptDataError(
-                    f"{shard.path} does not start with an episode's first row; run `navrep-data verify {self.root}`."
-                )
-            stop = np.append(first[1:], shard.rows)
-            parts.append(
-                [
-                    shard.read_rows("sequence", first).astype(np.int64),
-                    shard.read_rows("episode", first).astype(np.int64),
-                    np.full(len(first), k, np.int64),
-                    first,
-                    stop - first,
-                    shard.read_rows("event", stop - 1),
-                ]
+    def _index_shard(self, k: int) -> ShardIndex:
+        """Return the index of the episodes of shard `k`, from its narrow columns."""
+        shard = self.shard(k)
+        first = np.flatnonzero(shard.read("is_first", 0, shard.rows))
+        if not len(first) or first[0] != 0:
+            raise CorruptDataError(
+                f"{shard.path} does not start with an episode's first row; run `navrep-data verify {self.root}`."
             )
-        if not parts:
-            none = np.empty(0, np.int64)
-            return Episodes(none, none, none, none, none, none.astype(np.uint8), none.astype(np.int8))
-        sequence, episode, where, start, length, event = (np.concatenate(c) for c in zip(*parts, strict=True))
-        split = np.full(len(sequence), -1, np.int8)
-        for code, name in enumerate(SPLITS):
-            ranges = np.array(sorted(self.manifest.splits.get(name, ())), np.int64).reshape(-1, 2)
-            if len(ranges):
-                at = np.searchsorted(ranges[:, 0], sequence, side="right") - 1
-                split[(at >= 0) & (sequence < ranges[np.maximum(at, 0), 1])] = code
-        return Episodes(sequence, episode, where, start, length, event, split)
+        stop = np.append(first[1:], shard.rows)
+        return (
+            shard.read_rows("sequence", first).astype(np.int64),
+            shard.read_rows("episode", first).astype(np.int64),
+            first,
+            shard.read_rows("event", stop - 1),
+        )
+
+    def _index(self) -> Episodes:
+        return join_index(self.manifest, [self._index_shard(k) for k in range(len(self.manifest.shards))])
+
+
+def join_index(manifest: Manifest, parts: Sequence[ShardIndex]) -> Episodes:
+    """Return the episodes of all shards: per shard sequence, episode, first row and event of each episode."""
+    if not parts:
+        none = np.empty(0, np.int64)
+        return Episodes(none, none, none, none, none, none.astype(np.uint8), none.astype(np.int8))
+    where = np.concatenate([np.full(len(part[0]), k, np.int64) for k, part in enumerate(parts)])
+    length = np.concatenate(
+        [np.diff(np.append(part[2], entry.rows)) for part, entry in zip(parts, manifest.shards, strict=True)]
+    )
+    sequence, episode, start, event = (np.concatenate(column) for column in zip(*parts, strict=True))
+    split = np.full(len(sequence), -1, np.int8)
+    for code, name in enumerate(SPLITS):
+        ranges = np.array(sorted(manifest.splits.get(name, ())), np.int64).reshape(-1, 2)
+        if len(ranges):
+            at = np.searchsorted(ranges[:, 0], sequence, side="right") - 1
+            split[(at >= 0) & (sequence < ranges[np.maximum(at, 0), 1])] = code
+    return Episodes(sequence, episode, where, start, length, event, split)
+
+
+def dataset_record(dataset: DatasetFolder | Path | str) -> dict[str, Any]:
+    """Return what identifies a dataset wherever it lies: for the checkpoint of what was trained on it.
+
+    Parameters
+    ----------
+    dataset : DatasetFolder or path-like
+        An open dataset, or its folder.
+
+    Returns
+    -------
+    dict
+        JSON values: ``name`` (environment, physics, seed), ``repo`` and ``revision`` (Hub repository and commit, None
+        where it did not come from there), ``content_hash`` (:func:`content_hash` of its rows), ``sequences``, ``rows``
+        and ``partial`` (whether it is a part of a larger one).
+    """
+    folder = dataset if isinstance(dataset, DatasetFolder) else DatasetFolder(dataset)
+    m, origin = folder.manifest, folder.origin
+    return {
+        "name": f"{m.env}, {m.physics} physics, seed {m.seed}",
+        "repo": origin.repo if origin else None,
+        "revision": origin.commit if origin else None,
+        "content_hash": content_hash(m),
+        "sequences": m.sequences,
+        "rows": m.rows,
+        "partial": not m.complete,
+    }
 
 
 def info(root: Path | str) -> dict[str, Any]:
@@ -209,7 +273,8 @@ def info(root: Path | str) -> dict[str, Any]:
     -------
     dict
         JSON values: env, physics, seed, sequences, rows, shards, bytes, bytes_per_row, columns, splits
-        (sequences per split), outcomes, versions, complete and others.
+        (sequences per split), outcomes, versions, complete, content_hash, license, partial (what the whole has, where
+        this is a part), origin (Hub repository and commit) and others.
     """
     m = Manifest.read(root)
     return {
@@ -232,4 +297,8 @@ def info(root: Path | str) -> dict[str, Any]:
         "outcomes": m.statistics.get("outcomes", {}),
         "policy": m.policy,
         "versions": m.versions,
+        "license": m.license,
+        "content_hash": content_hash(m),
+        "partial": m.partial,
+        "origin": origin.to_dict() if (origin := read_origin(root)) else None,
     }

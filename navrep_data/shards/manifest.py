@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -18,11 +19,14 @@ from navrep_data.io import atomic_write_bytes, json_bytes, read_json
 from navrep_data.schema import FORMAT_NAME, FORMAT_VERSION, SensorContract
 from navrep_data.shards._fields import SHA256, Fields, is_range
 from navrep_data.shards._layout import SCAN_DTYPES, column_order
-from navrep_data.shards.entries import SPLIT_RULE, SPLITS, Ranges, ShardEntry, default_splits
+from navrep_data.shards.entries import SPLIT_RULE, SPLITS, FileEntry, Ranges, ShardEntry, default_splits
 from navrep_data.shards.statistics import check_statistics, merge_statistics
 
 MANIFEST_FILE = "manifest.json"
 CARD_FILE = "README.md"
+PARTIAL_FIELDS = ("manifest_sha256", "shards", "sequences", "rows")
+"""What the manifest of a copy with some of the shards says of the whole: its hash, and how much it has."""
+_LICENSE = re.compile(r"[a-z0-9][a-z0-9.+-]{0,63}")
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,12 @@ class Manifest:
         Command line that makes the same dataset, for the card.
     card_sha256 : str or None
         Hash of README.md; None while not complete.
+    license : str or None
+        Licence identifier of the Hub, once published.
+    extras : tuple of FileEntry
+        What a published dataset has besides: pictures for its card, an index of its episodes.
+    partial : dict or None
+        In a copy that holds some shards only: what the whole has, see :data:`PARTIAL_FIELDS`.
     format_version : int
         Version of the format.
     """
@@ -89,6 +99,9 @@ class Manifest:
     statistics: dict[str, Any] = field(default_factory=dict, repr=False)
     command: str = ""
     card_sha256: str | None = None
+    license: str | None = None
+    extras: tuple[FileEntry, ...] = ()
+    partial: dict[str, Any] | None = None
     format_version: int = FORMAT_VERSION
 
     @property
@@ -129,6 +142,8 @@ class Manifest:
             statistics=merge_statistics(shard.statistics for shard in ordered),
             splits=dict(splits) if splits is not None else default_splits(stop),
             card_sha256=None,
+            extras=(),  # they were made from other shards
+            partial=None,
         )
         problem = _check_shards(manifest) or _check_splits(manifest)
         if problem:
@@ -168,8 +183,15 @@ class Manifest:
             "split_rule": self.split_rule,
             "splits": {name: [list(r) for r in ranges] for name, ranges in self.splits.items()},
             "shards": [_entry_dict(shard) for shard in self.shards],
-            "card_sha256": self.card_sha256,
         }
+        # absent where they do not apply, so that what generate writes has never heard of them
+        if self.license is not None:
+            values["license"] = self.license
+        if self.extras:
+            values["extras"] = [asdict(entry) for entry in self.extras]
+        if self.partial is not None:
+            values["partial"] = self.partial
+        values["card_sha256"] = self.card_sha256
         values["manifest_sha256"] = _hash(values)
         return values
 
@@ -317,8 +339,33 @@ def _parse(fields: Fields, root: Path) -> Manifest:
         statistics=_parse_statistics(fields, columns),
         command=fields.get("command", str),
         card_sha256=None if card is None else fields.sha256("card_sha256"),
+        **_parse_publication(fields, root),
         format_version=fields.count("format_version"),
     )
+
+
+def _parse_publication(fields: Fields, root: Path) -> dict[str, Any]:
+    """Return the fields that only published datasets and partial copies of them have."""
+    license, partial = fields.values.get("license"), fields.values.get("partial")
+    if license is not None and check_license(license):
+        fields.bad("license", "a licence identifier such as cc-by-4.0")
+    extras = fields.get("extras", list) if "extras" in fields.values else []
+    if partial is not None:
+        whole = Fields(partial, fields.path, "partial.")
+        partial = {"manifest_sha256": whole.sha256("manifest_sha256")}
+        partial |= {name: whole.count(name) for name in PARTIAL_FIELDS[1:]}
+    return {
+        "license": license,
+        "extras": tuple(Fields(v, fields.path, f"extras[{k}].").file(root) for k, v in enumerate(extras)),
+        "partial": partial,
+    }
+
+
+def check_license(license: Any) -> str:
+    """Return what is wrong with a licence identifier, or an empty string."""
+    if isinstance(license, str) and _LICENSE.fullmatch(license):
+        return ""
+    return f"the licence is {str(license)[:60]!r}, expected an identifier such as cc-by-4.0, cc0-1.0, mit or other"
 
 
 def _parse_sensor(fields: Fields) -> SensorContract:
@@ -381,8 +428,11 @@ def _check_shards(manifest: Manifest) -> str:
             return f"{shard.file} has {shard.rows} rows for {count} sequences of at most {manifest.length}"
         stop = shard.sequences[1]
     files = [s.file for s in manifest.shards] + [s.worlds.file for s in manifest.shards if s.worlds]
+    files += [CARD_FILE, MANIFEST_FILE, *(entry.file for entry in manifest.extras)]
     if len(set(files)) != len(files):
         return "a file is listed twice"
+    if manifest.complete and manifest.partial is not None:
+        return "it is marked both complete and partial"
     if manifest.complete and stop != manifest.planned:
         return f"it is marked complete with {stop} of {manifest.planned} sequences"
     return ""

@@ -18,6 +18,7 @@ from navrep_data.shards.card import dataset_card
 from navrep_data.shards.entries import FileEntry, ShardEntry
 from navrep_data.shards.lock import LOCK_FILE
 from navrep_data.shards.manifest import CARD_FILE, MANIFEST_FILE, Manifest
+from navrep_data.shards.origin import ORIGIN_FILE, read_origin
 from navrep_data.shards.reader import Shard
 from navrep_data.shards.statistics import ShardStatistics, merge_statistics, scan_scale
 from navrep_data.shards.worlds import MAX_WORLDS_BYTES, parse_worlds
@@ -117,6 +118,11 @@ def verify(root: Path | str, *, progress: Callable[[int, int], None] | None = No
     report.bytes += (root / MANIFEST_FILE).stat().st_size
     report.problems += _check_card(root, manifest)
     report.problems += _check_unlisted(root, manifest)
+    report.problems += _check_origin(root, manifest)
+    for extra in manifest.extras:
+        report.problems += [Problem(extra.file, bad)] if (bad := _check_file(root, extra)) else []
+        report.files += 1
+        report.bytes += extra.bytes
     total = len(manifest.shards)
     for k, entry in enumerate(manifest.shards):
         found = list(_check_shard(root, manifest, entry))
@@ -154,6 +160,20 @@ def _check_card(root: Path, manifest: Manifest) -> Iterator[Problem]:
         yield Problem(CARD_FILE, f"differs from its SHA-256 in the manifest; {_AGAIN}")
     elif sha256_bytes(dataset_card(manifest).encode()) != manifest.card_sha256:
         yield Problem(CARD_FILE, "is not the card that this version writes for this manifest")
+
+
+def _check_origin(root: Path, manifest: Manifest) -> Iterator[Problem]:
+    try:
+        origin = read_origin(root)
+    except NavrepDataError as error:
+        yield Problem(ORIGIN_FILE, str(error))
+        return
+    if origin is not None:
+        whole = manifest.partial or manifest.to_dict()
+        if whole["manifest_sha256"] != origin.manifest_sha256:
+            yield Problem(
+                ORIGIN_FILE, f"names another dataset than {MANIFEST_FILE}: it was changed since it was pulled"
+            )
 
 
 def _check_unlisted(root: Path, manifest: Manifest) -> Iterator[Problem]:

@@ -150,3 +150,11 @@ def test_foreign_or_broken_networks_are_not_saved(tmp_path):
     with pytest.raises(CheckpointError, match="holds NaN"):
         checkpoint.save(module, tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_dataset_is_recorded_by_content_hash(tmp_path):
+    record = {"name": "soadrl", "repo": "user/name", "revision": "a" * 40, "content_hash": "b" * 64, "split": "train"}
+    checkpoint.save(checkpoint.make("controller", {}), tmp_path, {"run": 1}, dataset=record)
+    assert checkpoint.read_config(tmp_path)["metadata"] == {"run": 1, "dataset": record}
+    with pytest.raises(ConfigError, match=r"lacks revision, content_hash; expected the provenance of a dataset"):
+        checkpoint.save(checkpoint.make("controller", {}), tmp_path, dataset={"name": "x", "repo": None})

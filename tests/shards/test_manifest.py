@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -25,12 +26,19 @@ from navrep_data.shards import (
     SPLITS,
     DatasetFolder,
     Manifest,
+    Origin,
+    choose_shards,
     chunk_rows,
+    content_hash,
     dataset_card,
+    dataset_record,
     default_splits,
     estimate_bytes,
     info,
+    read_origin,
+    select_shards,
     split_of,
+    verify,
     writer_lock,
 )
 from navrep_data.shards.manifest import _hash
@@ -223,7 +231,9 @@ def test_info_and_card(dataset):
     files = [p for folder in ("data", "worlds") for p in (dataset / folder).iterdir()]
     assert values["bytes"] == sum(p.stat().st_size for p in files)
     card = (dataset / "README.md").read_text()
-    assert card.startswith("---\nlicense: mit\n")
+    assert card.startswith("---\npretty_name: ")  # no licence before somebody chose one
+    published = replace(Manifest.read(dataset), license="cc-by-4.0")
+    assert dataset_card(published).startswith("---\nlicense: cc-by-4.0\npretty_name: ")
     assert all(f"| `{name}` |" in card for name in ALL_COLUMNS)
     assert "navrep-data generate --env soadrl --n 6" in card
     assert "not made or endorsed by the NavRep authors" in " ".join(card.split())
@@ -243,3 +253,116 @@ def test_estimate_is_near_for_full_size_columns():
     assert less < estimate_bytes(ALL_COLUMNS, 1_000_000, **kwargs)
     assert MAX_HUMANS < 30
     assert chunk_rows(1000) == 25
+
+
+@pytest.fixture
+def six(tmp_path):
+    """Six sequences in three shards."""
+    make_dataset(tmp_path / "six", 6, 2, 50)
+    return tmp_path / "six"
+
+
+def test_a_part_of_a_dataset_is_a_dataset_that_says_so(six):
+    whole = Manifest.read(six)
+    assert select_shards(whole, range(len(whole.shards))) is whole
+    part = select_shards(whole, [0, 2])
+    assert Manifest.from_dict(json.loads(json.dumps(part.to_dict())), six) == part
+    assert (part.complete, part.planned, part.sequences) == (False, whole.planned, 4)
+    assert part.partial["manifest_sha256"] == whole.to_dict()["manifest_sha256"]
+    assert {k: whole.split_of(k) for k in (0, 1, 4, 5)} == {k: part.split_of(k) for k in (0, 1, 4, 5)}
+    assert part.split_of(2) is None
+    assert part.rows == sum(whole.shards[k].rows for k in (0, 2))
+    part.save(six, dataset_card(part))
+    for name in (whole.shards[1].file, whole.shards[1].worlds.file):
+        (six / name).unlink()
+    assert verify(six).problems == []
+    assert info(six)["splits"] == {"train": 3, "val": 1, "test": 0}
+    assert "a part**: 2 of 3 shards, 4 of 6 sequences" in (six / "README.md").read_text()
+    with DatasetFolder(six) as folder:
+        assert set(folder.episodes.sequence.tolist()) == {0, 1, 4, 5}
+        assert folder.provenance["partial"] is True
+
+
+@pytest.mark.parametrize(
+    ("asked", "chosen"),
+    [
+        ({}, [0, 1, 2]),
+        ({"split": "val"}, [0]),
+        ({"split": "test"}, [1]),
+        ({"split": "train", "shards": [1, 2]}, [1, 2]),
+    ],
+)
+def test_choose_shards(six, asked, chosen):
+    assert choose_shards(Manifest.read(six), **asked) == chosen
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"split": "vall"}, "Unknown split 'vall'; expected train, val, test. Did you mean 'val'?"),
+        ({"shards": [0, 3]}, "There is no shard 3, expected numbers from 0 to 2."),
+        ({"split": "val", "shards": [1]}, "No shard is left"),
+    ],
+)
+def test_choose_shards_refuses(six, asked, words):
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        choose_shards(Manifest.read(six), **asked)
+
+
+def test_content_hash_is_of_the_rows_alone(dataset, tmp_path):
+    m = Manifest.read(dataset)
+    assert content_hash(replace(m, license="mit", command="other", versions={})) == content_hash(m)
+    one_shard = make_dataset(tmp_path / "one", 6, 6, 100)
+    assert content_hash(one_shard) == content_hash(m)
+    seen = {content_hash(m), content_hash(select_shards(m, [0])), content_hash(replace(m, columns=m.columns[:-1]))}
+    digests = (*m.shards[0].sequence_hashes[::-1],)
+    swapped = replace(m, shards=(replace(m.shards[0], sequence_hashes=digests), *m.shards[1:]))
+    assert len({*seen, content_hash(swapped)}) == 4
+
+
+def test_card_lists_shards_by_split_where_each_belongs_to_one(tmp_path):
+    yaml = pytest.importorskip("yaml")
+    manifest = make_dataset(tmp_path, 4, 1, 20)
+    head = yaml.safe_load(dataset_card(manifest).split("---\n")[1])
+    files = {d["split"]: d["path"] for d in head["configs"][0]["data_files"]}
+    assert files == {
+        "train": ["data/shard-00000.h5", "data/shard-00003.h5"],
+        "val": ["data/shard-00001.h5"],
+        "test": ["data/shard-00002.h5"],
+    }
+    assert "Each shard belongs to one split" in dataset_card(manifest)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"license": "my licence"}, "field 'license' is 'my licence', expected a licence identifier"),
+        ({"extras": [{"file": "../x.png", "sha256": "0" * 64, "bytes": 1}]}, "points outside the dataset"),
+        ({"extras": [{"file": "README.md", "sha256": "0" * 64, "bytes": 1}]}, "a file is listed twice"),
+        ({"partial": {"manifest_sha256": "0" * 64, "shards": 1, "sequences": 1, "rows": 1}}, "both complete and part"),
+        ({"partial": {"manifest_sha256": "0" * 64, "shards": -1}}, "field 'partial.shards' is -1"),
+    ],
+)
+def test_publication_fields_are_checked(dataset, change, words):
+    values = {**Manifest.read(dataset).to_dict(), **change}
+    values["manifest_sha256"] = _hash(values)
+    with pytest.raises(CorruptDataError, match=re.escape(words)):
+        Manifest.from_dict(values, dataset)
+
+
+def test_origin(dataset):
+    assert read_origin(dataset) is None
+    origin = Origin(
+        "user/name", "a" * 40, "main", "https://hub.example", Manifest.read(dataset).to_dict()["manifest_sha256"]
+    )
+    origin.save(dataset)
+    assert read_origin(dataset) == origin
+    assert verify(dataset).ok
+    assert info(dataset)["origin"]["commit"] == "a" * 40
+    record = dataset_record(dataset)
+    assert (record["repo"], record["revision"]) == ("user/name", "a" * 40)
+    replace(origin, manifest_sha256="0" * 64).save(dataset)
+    assert "names another dataset" in str(verify(dataset).problems)
+    replace(origin, commit="main").save(dataset)
+    with pytest.raises(CorruptDataError, match="expected user/name@commit"):
+        read_origin(dataset)
