@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from navrep_data._version import __version__
-from navrep_data.cli import generate, import_npz, info, models, verify
+from navrep_data.cli import encode, evaluate, generate, import_npz, info, models, train, verify
 from navrep_data.errors import NavrepDataError, did_you_mean
 
 app = typer.Typer(
@@ -25,6 +25,9 @@ app.command("info")(info.info_command)
 app.command("verify")(verify.verify_command)
 app.command("import-npz")(import_npz.import_npz_command)
 app.add_typer(models.models_app, name="models")
+app.command("encode")(encode.encode_command)
+app.add_typer(train.train_app, name="train")
+app.add_typer(evaluate.evaluate_app, name="evaluate")
 
 # Newer typers carry their own click; these are the classes that the installed one raises, whichever that is.
 _UsageError: type[Any] = typer.BadParameter.__mro__[1]

@@ -77,7 +77,7 @@ class LatentManifest:
     encoder : dict
         ``name``, ``weights_sha256`` (of V's weights), ``lidar``.
     source : dict
-        ``content_sha256``, ``env``, ``physics``, ``rows`` of the dataset that was encoded.
+        ``content_hash``, ``env``, ``physics``, ``rows`` of the dataset that was encoded.
     sensor : dict
         Its sensor contract.
     splits : dict

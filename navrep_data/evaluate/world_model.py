@@ -155,8 +155,9 @@ def _open(model: WorldModel, data: Path, split: Any, window: int) -> SequenceDat
     folder.close()
     for key, value in expected.to_dict().items():
         if abs(float(getattr(sensor, key)) - float(value)) > 1e-4:
+            seen = getattr(sensor, key)
             raise DatasetMismatchError(
-                f"{data} has scans with {key} = {getattr(sensor, key)}, expected {value}: the model takes this sensor only."
+                f"{data} has scans with {key} = {seen}, expected {value}: the model takes this sensor only."
             )
     lidar: Any = model.lidar
     alignment: Any = model.config.action_alignment
@@ -286,9 +287,8 @@ def table(results: list[WorldModelError]) -> list[str]:
     """Return lines for people: one model per line, errors of lidar and goal apart."""
     width = max([len(r.name) for r in results] + [5])
     k = len(results[0].dream_scan_mse)
-    lines = [
-        f"{'model':{width}}  lidar  {'scan':>9} {'goal m2':>9}  {'V alone':>9}  {'dream ' + str(k):>9} {'goal m2':>9}  rows"
-    ]
+    dreamed = f"dream {k}"
+    lines = [f"{'model':{width}}  lidar  {'scan':>9} {'goal m2':>9}  {'V alone':>9}  {dreamed:>9} {'goal m2':>9}  rows"]
     for r in results:
         lines.append(
             f"{r.name:{width}}  {r.lidar:5}  {r.scan_mse:9.5f} {r.goal_mse:9.5f}  {r.reconstruction_mse:9.5f}  "

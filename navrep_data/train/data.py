@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -31,15 +30,6 @@ class _Windows(Protocol):
     def batch(self, indices: Any) -> Batch: ...
 
 
-def content_hash(folder: DatasetFolder) -> str:
-    """Return the hash of a dataset's content: of the content hashes of all its sequences, in order."""
-    digest = hashlib.sha256()
-    for shard in folder.manifest.shards:
-        for value in shard.sequence_hashes:
-            digest.update(value.encode())
-    return digest.hexdigest()
-
-
 def check_sensor(sensor: SensorContract, who: str) -> None:
     """Raise unless scans of `sensor` are what the networks take.
 
@@ -63,20 +53,18 @@ def describe_dataset(root: Path, model: str) -> dict[str, Any]:
         latents = LatentDataset(root, window=1).manifest
         check_sensor(SensorContract(**latents.sensor), str(root))
         return {**latents.source, "encoder": latents.encoder, "sensor": latents.sensor}
-    folder = DatasetFolder(root)
-    m = folder.manifest
-    check_sensor(m.sensor, str(root))
-    found = {
-        "content_sha256": content_hash(folder),
-        "env": m.env,
-        "physics": m.physics,
-        "seed": m.seed,
-        "sequences": m.sequences,
-        "rows": m.rows,
-        "sensor": m.sensor.to_dict(),
-    }
-    folder.close()
-    return found
+    with DatasetFolder(root) as folder:
+        check_sensor(folder.manifest.sensor, str(root))
+        m = folder.manifest
+        return {
+            **folder.provenance,
+            "env": m.env,
+            "physics": m.physics,
+            "seed": m.seed,
+            "sequences": m.sequences,
+            "rows": m.rows,
+            "sensor": m.sensor.to_dict(),
+        }
 
 
 def _free_bytes() -> int:

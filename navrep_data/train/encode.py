@@ -23,7 +23,7 @@ from navrep_data.models import VAE, WorldModel, observation_from_rings, observat
 from navrep_data.schema import SCAN_SCALE
 from navrep_data.shards import DatasetFolder, writer_lock
 from navrep_data.train import passes
-from navrep_data.train.data import check_sensor, content_hash
+from navrep_data.train.data import check_sensor
 
 _BATCH = 256
 
@@ -130,7 +130,7 @@ def _plan(folder: DatasetFolder, vae: VAE, name: str, precision: str) -> LatentM
     return LatentManifest(
         vae.config.z_size,
         {"name": name, "weights_sha256": weights_hash(vae), "lidar": vae.config.lidar, "precision": precision},
-        {"content_sha256": content_hash(folder), "env": m.env, "physics": m.physics, "seed": m.seed, "rows": m.rows},
+        {**folder.provenance, "env": m.env, "physics": m.physics, "seed": m.seed, "rows": m.rows},
         m.sensor.to_dict(),
         {split: [list(r) for r in ranges] for split, ranges in m.splits.items()},
     )

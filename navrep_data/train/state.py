@@ -90,7 +90,7 @@ def save(
     part = target.with_name(target.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
-    checkpoint.save(model, part, metadata)
+    checkpoint.save(model, part, metadata, dataset=metadata["dataset"])
     names = [name for name, _ in model.named_parameters()]
     tensors = {f"extra/{name}": t.detach().cpu().contiguous() for name, t in progress.extra.items()}
     by_name = dict(model.named_parameters())

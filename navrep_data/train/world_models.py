@@ -177,7 +177,7 @@ def _claim(out: Path, recipe: Recipe, data: dict[str, Any], resume: bool) -> Non
                 f"{out} was started with {name} = {str(old.get(name))[:40]}, this resume has {value}: use the settings "
                 f"in {path}, or start anew in another folder."
             )
-    for name in ("content_sha256", "encoder"):
+    for name in ("content_hash", "encoder"):
         if before.get("data", {}).get(name) != data.get(name):
             raise DatasetMismatchError(
                 f"{out} was trained on other data ({name} differs): resume with the dataset it was started with."
