@@ -217,3 +217,80 @@ def _next(recipe: Recipe, data: Path, out: Path) -> str:
     if recipe.model == "m":
         return f"navrep-data evaluate world-model {out}/world_model --data DIR"
     return f"navrep-data evaluate world-model {out} --data {data} --split val"
+
+
+Validate = Annotated[
+    int | None, typer.Option("--validate-every", help="Steps between validations.", show_default="the recipe's")
+]
+PpoSteps = Annotated[
+    int | None, typer.Option("--steps", help="Steps of all worlds together.", show_default="the recipe's")
+]
+Worlds = Annotated[int | None, typer.Option("--worlds", help="Worlds stepped at once.", show_default="the recipe's")]
+PpoBatch = Annotated[int | None, typer.Option("--batch", help="Rows per gradient step.", show_default="the recipe's")]
+
+
+@train_app.command("controller")
+def controller_command(
+    world_model: Annotated[str, typer.Option("--world-model", metavar="NAME|DIR", help="What it sees through.")],
+    out: Out,
+    features: Annotated[str, typer.Option("--features", help="z, h or zh.")] = "z",
+    original: Original = False, steps: PpoSteps = None, worlds: Worlds = None, batch: PpoBatch = None,
+    seed: Seed = None, validate_every: Validate = None, settings: Settings = None, init: Init = None,
+    resume: Resume = False, stop_after: StopAfter = None, device: Device = "cpu", threads: Threads = None,
+    source: From = None, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Train a controller by PPO on the codes of a frozen world model."""
+    from navrep_data.train.encode import vae_of
+    from navrep_data.zoo.local import load_any_model
+
+    use_threads(threads)
+    check_device(device)
+    if features not in ("z", "h", "zh"):
+        raise ConfigError(f"--features is {features!r}, expected z, h or zh.")
+    model = load_any_model(world_model, source)
+    lidar = vae_of(model, world_model).config.lidar
+    changes = {"steps": steps, "worlds": worlds, "batch": batch, "seed": seed, "validate_every": validate_every}
+    _train_controller(
+        features, lidar, original, settings, changes, out, model, world_model, init, resume, stop_after, device, source,
+        as_json,
+    )  # fmt: skip
+
+
+@train_app.command("e2e")
+def e2e_command(
+    out: Out, lidar: Lidar = "rings", original: Original = False, steps: PpoSteps = None, worlds: Worlds = None,
+    batch: PpoBatch = None, seed: Seed = None, validate_every: Validate = None, settings: Settings = None,
+    init: Init = None, resume: Resume = False, stop_after: StopAfter = None, device: Device = "cpu",
+    threads: Threads = None, source: From = None, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Train an end-to-end network by PPO."""
+    use_threads(threads)
+    check_device(device)
+    changes = {"steps": steps, "worlds": worlds, "batch": batch, "seed": seed, "validate_every": validate_every}
+    _train_controller(
+        "e2e", lidar, original, settings, changes, out, None, "", init, resume, stop_after, device, source, as_json
+    )
+
+
+def _train_controller(
+    features: str, lidar: str, original: bool, settings: list[str] | None, changes: dict[str, Any], out: Path,
+    model: Any, name: str, init: str | None, resume: bool, stop_after: int | None, device: str, source: str | None,
+    as_json: bool,
+) -> None:  # fmt: skip
+    from navrep_data.train import default_controller_recipe, original_controller_recipe, train_controller
+    from navrep_data.zoo.local import load_any_model
+
+    recipe = (original_controller_recipe if original else default_controller_recipe)(features, lidar)
+    recipe = recipe.replace(**changes).replace(**parse_settings(recipe.to_dict(), settings))
+    start = None if init is None else load_any_model(init, source)
+    done = train_controller(
+        recipe, out, model=model, model_name=name, init=start, resume=resume, stop_after=stop_after, device=device,
+        progress=show_progress(), report=say_err,
+    )  # fmt: skip
+    if as_json:
+        print_json(
+            {"out": str(out), "steps": done.steps, "best_validation": done.best, "steps_per_s": done.steps_per_s,
+             "held_out": done.held_out}
+        )  # fmt: skip
+    else:
+        say(f"{out}: best of {done.steps:,} steps reaches the goal in {done.best:.1%} of the validation episodes")

@@ -136,3 +136,31 @@ def picture(columns: Mapping[str, NDArray[Any]], lidar: str, title: str) -> tupl
     canvas.print_png(buffer)  # type: ignore[no-untyped-call]
     image = np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
     return buffer.getvalue(), image
+
+
+def curve(out: Path) -> Path | None:
+    """Draw a training's success rates over steps into ``training.png``; None where nothing was logged yet."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = read_log(out)
+    if not rows:
+        return None
+    figure = Figure(figsize=(6.4, 3.6), dpi=120, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    for name, label, style in (
+        ("success", "training, at the worlds' own difficulty", "-"),
+        ("val_success", "validation, greatest difficulty", ".-"),
+    ):
+        points = [(int(r["step"]), float(r[name])) for r in rows if name in r]
+        if points:
+            axis.plot([p[0] / 1e6 for p in points], [100 * p[1] for p in points], style, label=label)
+    axis.set_xlabel("million steps")
+    axis.set_ylabel("episodes that reach the goal [%]")
+    axis.set_ylim(0, 100)
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8)
+    path = out / "training.png"
+    canvas.print_png(str(path))  # type: ignore[no-untyped-call]
+    return path

@@ -78,8 +78,11 @@ def save(
     optimizer: torch.optim.Optimizer,
     progress: Progress,
     metadata: Mapping[str, Any],
+    trained: nn.Module | None = None,
 ) -> Path:
     """Write a checkpoint into a new folder, then move it to its name.
+
+    `trained` is the module whose parameters the optimiser holds, where that is not `model` itself.
 
     Raises
     ------
@@ -90,12 +93,10 @@ def save(
     part = target.with_name(target.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
-    checkpoint.save(model, part, metadata, dataset=metadata["dataset"])
-    names = [name for name, _ in model.named_parameters()]
+    checkpoint.save(model, part, metadata, dataset=metadata.get("dataset"))
     tensors = {f"extra/{name}": t.detach().cpu().contiguous() for name, t in progress.extra.items()}
-    by_name = dict(model.named_parameters())
-    for name in names:
-        for key, value in optimizer.state.get(by_name[name], {}).items():
+    for name, parameter in (trained or model).named_parameters():
+        for key, value in optimizer.state.get(parameter, {}).items():
             tensors[f"optimizer/{name}/{key}"] = torch.as_tensor(value).detach().cpu().contiguous()
     data = safetensors.torch.save(tensors)
     atomic_write_bytes(part / _WEIGHTS, data)
@@ -153,8 +154,10 @@ def last_folder(out: Path) -> Path | None:
     return folder
 
 
-def load(folder: Path, model: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
-    """Put a checkpoint's weights into model and optimiser; returns where it stood.
+def load(
+    folder: Path, model: nn.Module, optimizer: torch.optim.Optimizer, trained: nn.Module | None = None
+) -> Progress:
+    """Put a checkpoint's weights into model and optimiser; returns where it stood. For `trained` see :func:`save`.
 
     Raises
     ------
@@ -177,7 +180,7 @@ def load(folder: Path, model: nn.Module, optimizer: torch.optim.Optimizer) -> Pr
         tensors = safetensors.torch.load(data)
     except safetensors.SafetensorError as error:
         raise CheckpointError(f"{path} is not a safetensors file ({error}).") from error
-    by_name = dict(model.named_parameters())
+    by_name = dict((trained or model).named_parameters())
     for key, tensor in tensors.items():
         if key.startswith("optimizer/"):
             name, what = key.removeprefix("optimizer/").rsplit("/", 1)

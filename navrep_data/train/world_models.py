@@ -146,16 +146,37 @@ def train_world_model(
     described = describe_dataset(data, recipe.model)
     if recipe.model == "m":
         recipe = recipe.replace(z_size=LatentManifest.read(data).z_size)
-    _claim(out, recipe, described, resume)
+    claim(out, recipe.to_dict(), described, resume)
     with writer_lock(out):
         loop = _Loop(recipe, data, out, described, torch.device(device), init, preload)
         return loop.run(recipe.steps if stop_after is None else min(stop_after, recipe.steps), progress, report)
 
 
-def _claim(out: Path, recipe: Recipe, data: dict[str, Any], resume: bool) -> None:
-    """Make the output folder with its recipe, or check that a resume agrees with it."""
+def claim(
+    out: Path, settings: dict[str, Any], data: dict[str, Any], resume: bool, free: tuple[str, ...] = _FREE_ON_RESUME
+) -> None:
+    """Make the output folder with its recipe, or check that a resume agrees with it.
+
+    Parameters
+    ----------
+    out : Path
+        Output folder.
+    settings : dict
+        The recipe.
+    data : dict
+        What it trains on; ``content_hash``, ``encoder`` and ``world_model_sha256`` must stay the same.
+    resume : bool
+        Whether there is a training to go on with.
+    free : tuple of str
+        Settings that may differ on a resume.
+
+    Raises
+    ------
+    FolderInUseError, ConfigError, DatasetMismatchError
+        If they do not agree.
+    """
     path = out / state.RECIPE_FILE
-    here = {"settings": recipe.to_dict(), "data": data, "version": __version__}
+    here = {"settings": settings, "data": data, "version": __version__}
     if not resume:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise FolderInUseError(
@@ -171,16 +192,16 @@ def _claim(out: Path, recipe: Recipe, data: dict[str, Any], resume: bool) -> Non
         raise ConfigError(f"There is no training to resume in {out}: expected {state.RECIPE_FILE}; leave out --resume.")
     before = read_json(path, _MAX_RECIPE)
     old = before.get("settings", {}) if isinstance(before, dict) else {}
-    for name, value in recipe.to_dict().items():
-        if name not in _FREE_ON_RESUME and old.get(name) != value:
+    for name, value in settings.items():
+        if name not in free and old.get(name) != value:
             raise ConfigError(
                 f"{out} was started with {name} = {str(old.get(name))[:40]}, this resume has {value}: use the settings "
                 f"in {path}, or start anew in another folder."
             )
-    for name in ("content_hash", "encoder"):
+    for name in ("content_hash", "encoder", "world_model_sha256"):
         if before.get("data", {}).get(name) != data.get(name):
             raise DatasetMismatchError(
-                f"{out} was trained on other data ({name} differs): resume with the dataset it was started with."
+                f"{out} was trained on other data ({name} differs): resume with those it was started with."
             )
 
 

@@ -42,15 +42,15 @@ def test_v_codes_m_and_their_error(dataset, tmp_path, capsys):
     code, out, err = call(capsys, "encode", dataset, "--model", v, "--out", codes, "--json")
     assert (code, json.loads(out)["rows"]) == (0, 180), err
     done = call(
-        capsys, "train", "m", "--data", codes, "--out", m, "--v", v, "--steps", 2, "--batch", 2, *FAST, "--set", "h_size=8",
-        "--set", "window=16", "--set", "stride=16", "--json",
+        capsys, "train", "m", "--data", codes, "--out", m, "--v", v, "--steps", 2, "--batch", 2, *FAST, "--set",
+        "h_size=8", "--set", "window=16", "--set", "stride=16", "--json",
     )  # fmt: skip
     assert done[0] == 0, done[2]
     assert json.loads(done[1])["step"] == 2
     figure = tmp_path / "f.png"
     code, out, err = call(
-        capsys, "evaluate", "world-model", m / "world_model", "--data", dataset, "--split", "val", "--steps", 2, "--json",
-        "--figure", figure,
+        capsys, "evaluate", "world-model", m / "world_model", "--data", dataset, "--split", "val", "--steps", 2,
+        "--json", "--figure", figure,
     )  # fmt: skip
     assert code == 0, err
     assert json.loads(out)["results"][0]["rows"] > 0

@@ -123,10 +123,8 @@ def test_resume_gives_the_same_losses_and_weights(model, dataset, latents, tmp_p
     assert first.losses + second.losses == whole.losses
     ours, theirs = (checkpoint.load(last_folder(tmp_path / name)) for name in ("whole", "parts"))
     assert all(torch.equal(a, b) for a, b in zip(ours.parameters(), theirs.parameters(), strict=True))
-    keep = [
-        {k: v for k, v in row.items() if k not in ("seconds", "frames_per_s")} for row in read_log(tmp_path / "whole")
-    ]
-    steps = [row["step"] for row in keep if "val_error" in row]
+    log = read_log(tmp_path / "parts")
+    steps = [row["step"] for row in log if "val_error" in row]
     assert steps == ["2", "4", "6"]
 
 
