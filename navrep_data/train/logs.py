@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -82,7 +83,8 @@ def read_log(out: Path) -> list[dict[str, str]]:
 def _tensorboard(folder: Path, after: int) -> Any:
     try:
         from torch.utils.tensorboard import SummaryWriter
-    except ImportError:  # an optional part: pip install navrep-data[train]
+    except ImportError:  # an optional part
+        print("No TensorBoard logs, only log.csv: pip install 'navrep-data[train]'", file=sys.stderr)
         return None
     return SummaryWriter(str(folder), purge_step=after + 1)
 
