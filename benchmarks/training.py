@@ -128,8 +128,8 @@ def measure(name: str, repeats: int, seconds: float) -> dict[str, Any]:
         ours, other = in_turns([training_step(name, False), training_step(name, True)], repeats, seconds)
         mine = spread(ours.wall)
         row = {
-            "value": mine["median"], "low": mine["low"], "high": mine["high"], "as_written": spread(other.wall)["median"],
-            "ratio": ratio(ours.wall, other.wall),
+            "value": mine["median"], "low": mine["low"], "high": mine["high"],
+            "as_written": spread(other.wall)["median"], "ratio": ratio(ours.wall, other.wall),
         }  # fmt: skip
     return {"name": name, "must": MUST.get(name), "aim": AIMS.get(name), **row}
 

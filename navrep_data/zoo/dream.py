@@ -32,6 +32,7 @@ GOAL_RADIUS = 0.4
 GOAL_REWARD = 100.0
 TIME_LIMIT = 35.0
 _REAL_ROWS = 8
+_HALF_VIEW = 10.0
 
 Observation = dict[str, NDArray[np.float32]]
 
@@ -227,12 +228,13 @@ class DreamEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         canvas = FigureCanvasAgg(figure)
         above, beside = figure.subplots(1, 2)
         points = scan_points(self._obs["scan"], (0.0, 0.0, 0.0), SensorContract())
-        goal = self._obs["robot_state"][:2]
+        # a goal beyond the picture is drawn at its edge
+        goal = np.clip(self._obs["robot_state"][:2], -_HALF_VIEW, _HALF_VIEW)
         above.plot(points[:, 0], points[:, 1], ".", markersize=1.2, color="#1d3557")
         above.plot([0], [0], "o", color="#d1495b", label="robot")
         above.plot([goal[0]], [goal[1]], "*", markersize=11, color="#3a7d44", label="goal, predicted")
-        above.set_xlim(-10, 10)
-        above.set_ylim(-10, 10)
+        above.set_xlim(-1.05 * _HALF_VIEW, 1.05 * _HALF_VIEW)
+        above.set_ylim(-1.05 * _HALF_VIEW, 1.05 * _HALF_VIEW)
         above.set_aspect("equal")
         above.set_title(f"dreamed {self._steps * DT:.1f} s", fontsize=9)
         above.legend(fontsize=7, loc="upper right")
