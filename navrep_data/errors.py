@@ -78,6 +78,10 @@ class CheckpointError(NavrepDataError, ValueError):
     """A file of weights is not what it should be: wrong format, names, shapes, sizes or content."""
 
 
+class TrainingError(NavrepDataError, ArithmeticError):
+    """A training cannot go on: its loss is no number."""
+
+
 class SimulationError(NavrepDataError, RuntimeError):
     """The simulator reached a state that it cannot go on from."""
 

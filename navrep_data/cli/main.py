@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from navrep_data._version import __version__
-from navrep_data.cli import benchmark, generate, hub, import_npz, info, models, play, verify
+from navrep_data.cli import benchmark, encode, evaluate, generate, hub, import_npz, info, models, play, train, verify
 from navrep_data.errors import NavrepDataError, did_you_mean
 
 app = typer.Typer(
@@ -30,6 +30,9 @@ app.command("push")(hub.push_command)
 app.command("pull")(hub.pull_command)
 app.command("push-model")(hub.push_model_command)
 app.add_typer(models.models_app, name="models")
+app.command("encode")(encode.encode_command)
+app.add_typer(train.train_app, name="train")
+app.add_typer(evaluate.evaluate_app, name="evaluate")
 
 # Newer typers carry their own click; these are the classes that the installed one raises, whichever that is.
 _UsageError: type[Any] = typer.BadParameter.__mro__[1]

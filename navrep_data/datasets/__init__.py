@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from navrep_data.datasets._batch import FIELDS
     from navrep_data.datasets.hub import pull, push
+    from navrep_data.datasets.latents import LatentDataset
     from navrep_data.datasets.loading import make_loader
     from navrep_data.datasets.npz import import_npz
     from navrep_data.datasets.scans import ScanDataset
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "FIELDS": "_batch",
+    "LatentDataset": "latents",
     "ScanDataset": "scans",
     "SequenceDataset": "sequences",
     "StreamingSequenceDataset": "streaming",
@@ -30,6 +32,7 @@ _HOMES = {
 
 __all__ = [
     "FIELDS",
+    "LatentDataset",
     "ScanDataset",
     "SequenceDataset",
     "StreamingSequenceDataset",

@@ -1,4 +1,4 @@
-"""Benchmark policies: suites of numbered episodes, metrics, tables, figures."""
+"""Measuring: benchmark suites of numbered episodes with metrics, tables and figures; world-model errors."""
 
 from navrep_data.evaluate.driver import Benchmark, benchmark, redraw
 from navrep_data.evaluate.metrics import METRICS, Metric

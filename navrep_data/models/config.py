@@ -12,6 +12,7 @@ from navrep_data.schema import N_RAYS, RINGS_SHAPE
 LIDARS = ("rings", "1d")
 CONTEXT_RULES = ("oldest-32", "newest-32", "carried-state")
 ACTION_ALIGNMENTS = ("leading", "taken")
+SQUASHES = ("clip", "tanh")
 # A config from outside must not make us allocate without bound: the largest network that passes has about 0.5 GB.
 _LARGEST = 16384
 _LARGEST_OF = {"z_size": 512, "h_size": 4096, "n_layers": 8, "n_blocks": 32, "n_mixture": 16, "n_hidden": 1024}
@@ -36,6 +37,8 @@ class ModelConfig:
                 raise ConfigError(
                     f"{field.name} of a {self.kind} is {str(value)[:40]}, expected a whole number from 1 to {limit}."
                 )
+            if field.type == "bool" and type(value) is not bool:
+                raise ConfigError(f"{field.name} of a {self.kind} is {str(value)[:40]!r}, expected true or false.")
         for name, allowed in (("lidar", LIDARS), ("action_alignment", ACTION_ALIGNMENTS)):
             value = getattr(self, name, allowed[0])
             if value not in allowed:
@@ -138,6 +141,8 @@ class JointConfig(ModelConfig):
         LSTM layers.
     action_alignment : str
         As for :class:`MemoryConfig`.
+    residual : bool
+        Predict the change of z and goal instead of their next values; the released models do not.
     """
 
     kind: ClassVar[str] = "joint"
@@ -146,6 +151,7 @@ class JointConfig(ModelConfig):
     h_size: int = 64
     n_layers: int = 2
     action_alignment: str = "leading"
+    residual: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -167,6 +173,8 @@ class TransformerConfig(ModelConfig):
         Longest sequence (learned positions).
     action_alignment : str
         As for :class:`MemoryConfig`.
+    residual : bool
+        As for :class:`JointConfig`.
     """
 
     kind: ClassVar[str] = "transformer"
@@ -176,6 +184,7 @@ class TransformerConfig(ModelConfig):
     n_heads: int = 8
     context: int = 32
     action_alignment: str = "leading"
+    residual: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -196,11 +205,21 @@ class ControllerConfig(ModelConfig):
     ----------
     n_inputs, n_hidden : int
         Features, and units per layer.
+    squash : str
+        How the network's output becomes an action: ``"clip"`` to [-1, 1], as the released ones; ``"tanh"``.
+    max_speed : float
+        Longest velocity vector that is commanded [m/s]; 0 = no limit beyond [-1, 1] on each axis.
     """
 
     kind: ClassVar[str] = "controller"
     n_inputs: int = 69
     n_hidden: int = 64
+    squash: str = "clip"
+    max_speed: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_bounds(self.kind, self.squash, self.max_speed)
 
 
 @dataclass(frozen=True)
@@ -213,9 +232,24 @@ class EndToEndConfig(ModelConfig):
         ``"rings"`` or ``"1d"``.
     n_features, n_hidden : int
         Numbers that the convolutions give, and units per layer.
+    squash, max_speed
+        As for :class:`ControllerConfig`.
     """
 
     kind: ClassVar[str] = "e2e"
     lidar: str = "1d"
     n_features: int = 32
     n_hidden: int = 64
+    squash: str = "clip"
+    max_speed: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_bounds(self.kind, self.squash, self.max_speed)
+
+
+def _check_bounds(kind: str, squash: str, max_speed: float) -> None:
+    if squash not in SQUASHES:
+        raise ConfigError(f"squash of a {kind} is {str(squash)[:40]!r}, expected one of: {', '.join(SQUASHES)}.")
+    if isinstance(max_speed, bool) or not isinstance(max_speed, int | float) or not 0.0 <= max_speed <= 10.0:
+        raise ConfigError(f"max_speed of a {kind} is {str(max_speed)[:40]}, expected 0 (no limit) to 10 m/s.")

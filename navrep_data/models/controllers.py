@@ -36,6 +36,8 @@ class ActorCritic(nn.Module):
         ``nn.Tanh`` or ``nn.ReLU``.
     """
 
+    config: ControllerConfig | EndToEndConfig
+
     def __init__(self, n_inputs: int, n_hidden: int, activation: type[nn.Module]) -> None:
         super().__init__()
         self.pi = _perceptron(n_inputs, n_hidden, activation)
@@ -59,6 +61,20 @@ class ActorCritic(nn.Module):
         x = self.features(inputs)
         return self.mean(self.pi(x)), self.value(self.vf(x)).squeeze(-1)
 
+    def command(self, mean: Tensor) -> Tensor:
+        """Return the velocities (B, 2) in [-1, 1] that outputs `mean` (B, 2) stand for, by the config's bounds."""
+        squashed = torch.tanh(mean) if self.config.squash == "tanh" else mean.clamp(-1.0, 1.0)
+        return limit_speed(squashed, self.config.max_speed)
+
+
+def limit_speed(velocity: Tensor, max_speed: float) -> Tensor:
+    """Return velocities (B, 2) shortened to `max_speed` [m/s] where they are longer; 0 = no limit."""
+    if max_speed == 0.0:
+        return velocity
+    length = torch.linalg.vector_norm(velocity, dim=-1, keepdim=True)
+    limited: Tensor = velocity * (max_speed / length.clamp_min(max_speed))
+    return limited
+
 
 class Controller(ActorCritic):
     """C of the paper: features to action and value.
@@ -68,6 +84,8 @@ class Controller(ActorCritic):
     config : ControllerConfig
         Sizes.
     """
+
+    config: ControllerConfig
 
     def __init__(self, config: ControllerConfig) -> None:
         super().__init__(config.n_inputs, config.n_hidden, nn.Tanh)
@@ -87,6 +105,8 @@ class EndToEnd(ActorCritic):
     Inputs are (B, 1085): ranges in *metres* and robot state, or (B, 4101): rings in {0, 0.5, 1} with the nearest
     cell as measured, and robot state.
     """
+
+    config: EndToEndConfig
 
     def __init__(self, config: EndToEndConfig) -> None:
         super().__init__(config.n_features + ROBOT_STATE_SIZE, config.n_hidden, nn.ReLU)

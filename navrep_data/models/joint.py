@@ -60,7 +60,10 @@ class JointWorldModel(WorldModel):
         """Return next z and next goal [m]; see :meth:`WorldModel.heads`."""
         x = self.ln_f(self.lstm_head(h))
         n = self.config.z_size
-        return self.z_head(x[..., :n]), self.state_head(x[..., n:])
+        next_z, next_goal = self.z_head(x[..., :n]), self.state_head(x[..., n:])
+        if self.config.residual:
+            return z + next_z, goal + next_goal
+        return next_z, next_goal
 
     def incremental(self, batch_size: int) -> JointStream:
         """Return a memory that carries the LSTM's state over the first 32 rows."""

@@ -142,7 +142,10 @@ class TransformerWorldModel(WorldModel):
 
     def heads(self, z: Tensor, goal: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """Return next z and next goal [m]; see :meth:`WorldModel.heads`."""
-        return self.z_head(h), self.state_head(h)
+        next_z, next_goal = self.z_head(h), self.state_head(h)
+        if self.config.residual:
+            return z + next_z, goal + next_goal
+        return next_z, next_goal
 
     def incremental(self, batch_size: int) -> TransformerStream:
         """Return a memory that keeps keys and values of the rows so far."""

@@ -116,6 +116,10 @@ class VAE(nn.Module):
 
     def decode(self, z: Tensor) -> Tensor:
         """Return observations of shape (..., 64, 64) or (..., 1080) in (0, 1) for codes of shape (..., z_size)."""
+        return torch.sigmoid(self.decode_logits(z))
+
+    def decode_logits(self, z: Tensor) -> Tensor:
+        """Return what :meth:`decode` gives before the last sigmoid: what losses are exactly computed from."""
         x = self.fc3(z.reshape(-1, z.shape[-1]))
         if self.config.lidar == "rings":
             blow_up = self.decoder[1]
@@ -123,9 +127,9 @@ class VAE(nn.Module):
             assert blow_up.bias is not None
             n_out, side = blow_up.weight.shape[1], blow_up.weight.shape[2]
             places = (x @ blow_up.weight.flatten(1)).reshape(-1, n_out, side, side)
-            images = self.decoder[2:](places + blow_up.bias[:, None, None])
+            images = self.decoder[2:-1](places + blow_up.bias[:, None, None])
         else:
-            images = self.decoder(x)
+            images = self.decoder[:-1](x)
         decoded: Tensor = images.reshape(*z.shape[:-1], *OBSERVATION_SHAPES[self.config.lidar])
         return decoded
 

@@ -112,6 +112,9 @@ class Policy:
         self._encoder = self._make_encoder(dtype, compile)
         self._stream: Stream | None = None
         self._noise: Noise | None = None
+        # what the memory is fed one step later, once the action taken is known
+        self._waiting: tuple[Tensor, Tensor, Tensor] | None = None
+        self._fresh = torch.zeros(0, dtype=torch.bool, device=self.device)
         self._last = torch.zeros(0, ACTION_SIZE, device=self.device)
 
     def _check_parts(self) -> None:
@@ -129,11 +132,6 @@ class Policy:
             n = z + ROBOT_STATE_SIZE + h
             if self.vae.config.lidar != self.lidar:
                 raise CheckpointError(f"{self._who()} is for {self.lidar}, its V for {self.vae.config.lidar}.")
-        if self.world_model is not None and self.world_model.config.action_alignment != "leading":
-            raise ConfigError(
-                f"The world model of {self._who()} takes the action chosen at a row, expected the one that led to it: "
-                "the former is not known before the policy has acted."
-            )
         if n != self.n_inputs:
             raise CheckpointError(
                 f"{self._who()} has {self.n_inputs} inputs, expected {n} from its parts: they do not belong together."
@@ -192,6 +190,7 @@ class Policy:
                     "batch_size beside it: one entry per robot."
                 )
             self._last[chosen] = 0.0
+            self._fresh[chosen] = True
             if self._stream is not None:
                 self._stream.reset(chosen)
             return
@@ -199,6 +198,7 @@ class Policy:
         if type(n) is not int or n < 1:
             raise PolicyError(f"batch_size is {n!r}, expected a whole number of at least 1.")
         self._last = torch.zeros(n, ACTION_SIZE, device=self.device)
+        self._waiting, self._fresh = None, torch.ones(n, dtype=torch.bool, device=self.device)
         self._noise = Noise.seeded(self.seed, self.device) if self.inference == "as_released" else None
         if self.world_model is not None:
             self._stream = self.world_model.stream(n, self.context, self._noise)
@@ -256,7 +256,7 @@ class Policy:
             mean = self.network.mean(self.network.pi(inputs))
         else:
             mean = self.network.mean(self.network.pi(features))
-        self._last = torch.nn.functional.pad(mean.clamp(-1.0, 1.0), (0, ACTION_SIZE - mean.shape[1]))
+        self._last = torch.nn.functional.pad(self.network.command(mean), (0, ACTION_SIZE - mean.shape[1]))
         action: ArrayT = _like(self._last.clone(), scan)
         return action
 
@@ -293,6 +293,34 @@ class Policy:
         return result
 
     @torch.no_grad()
+    def look(self, scan: NDArray[Any], robot_state: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return what the controller takes but for the memory, of any number of rows, without a step in it.
+
+        Parameters
+        ----------
+        scan, robot_state
+            As for :meth:`act`, with any number of rows.
+
+        Returns
+        -------
+        features : ndarray of shape (B, F)
+            [z, robot state] or [robot state]; end-to-end: [observation, robot state].
+        robot_state : ndarray of shape (B, 5)
+            As given, float32.
+        """
+        assert self.lidar is not None
+        ranges, state = np.ascontiguousarray(scan, np.float32), _tensor(robot_state, self.device)
+        if self.features == "h":
+            return state.cpu().numpy(), state.cpu().numpy()
+        obs = observation_from_scan(ranges, self.lidar, self.features is not None).to(self.device)
+        if self.features is None:
+            front = torch.tensor(ranges, device=self.device) if self.lidar == "1d" else obs.flatten(1)
+        else:
+            assert self._encoder is not None
+            front = self._encoder(obs)
+        return torch.cat([front, state], dim=1).cpu().numpy(), state.cpu().numpy()
+
+    @torch.no_grad()
     def controller(self, features: ArrayT) -> tuple[ArrayT, ArrayT]:
         """Return the mean action, unclipped, (B, 2) and the value (B,) of features (B, F).
 
@@ -315,7 +343,7 @@ class Policy:
         if self._stream is not None and not self._stream.listens() and self.features == "h":
             # all contexts are full: nothing that the lidar sees changes h any more
             ignored = state.new_zeros(len(state), self.world_model.z_size if self.world_model is not None else 0)
-            return torch.cat([state, self._stream.step(ignored, ignored, state[:, :2], self._last)], dim=1), state
+            return torch.cat([state, self._remember(ignored, ignored, state[:, :2])], dim=1), state
         assert self.lidar is not None
         if self.features is None:
             if self.lidar == "1d":
@@ -332,8 +360,31 @@ class Policy:
             return torch.cat([mu, state], dim=1), state
         if self._noise is not None:
             mu, logvar = self.vae.distribution(obs)
-        h = self._stream.step(mu, logvar, state[:, :2], self._last)
+        h = self._remember(mu, logvar, state[:, :2])
         return torch.cat([mu, state, h] if self.features == "zh" else [state, h], dim=1), state
+
+    def _remember(self, mu: Tensor, logvar: Tensor, goal: Tensor) -> Tensor:
+        """Take one step in the memory and return h (B, H).
+
+        Notes
+        -----
+        A memory that is fed the action chosen at a row cannot take this row in before the policy has acted. Its h is
+        that after the row before, which has predicted this one, and zero on an episode's first row.
+        """
+        assert self._stream is not None
+        assert self.world_model is not None
+        if self.world_model.config.action_alignment == "leading":
+            return self._stream.step(mu, logvar, goal, self._last)
+        before, self._waiting = self._waiting, (mu.clone(), logvar.clone(), goal.clone())
+        if before is None:
+            h = mu.new_zeros(len(mu), self.world_model.h_size)
+        else:
+            h = self._stream.step(*before, self._last)
+            if bool(self._fresh.any()):  # what was fed for them belongs to the episode before
+                self._stream.reset(self._fresh)
+                h[self._fresh] = 0.0
+        self._fresh[:] = False
+        return h
 
     def _checked(
         self, scan: NDArray[Any] | Tensor, robot_state: NDArray[Any] | Tensor

@@ -1,0 +1,57 @@
+"""``navrep-data evaluate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from navrep_data.cli._common import print_json, say, show_progress
+from navrep_data.errors import ConfigError
+
+evaluate_app = typer.Typer(help="Measure world models.", no_args_is_help=True)
+
+
+@evaluate_app.command("world-model")
+def world_model_command(
+    models: Annotated[list[str], typer.Argument(metavar="NAME|DIR...", help="World models.")],
+    data: Annotated[Path, typer.Option("--data", metavar="DIR", help="Dataset folder.")],
+    split: Annotated[str, typer.Option("--split", help="train (as the paper), val or test.")] = "train",
+    steps: Annotated[int, typer.Option("--steps", help="Steps of the free-running dream.")] = 16,
+    limit: Annotated[int | None, typer.Option("--limit", help="Windows looked at.", show_default="all")] = None,
+    figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Draw the errors.")] = None,
+    device: Annotated[str, typer.Option("--device", help="cpu, cuda, ...")] = "cpu",
+    threads: Annotated[int | None, typer.Option("--threads", help="Threads of torch.", show_default="torch's")] = None,
+    source: Annotated[str | None, typer.Option("--from", metavar="DIR", help="Folder with the authors' files.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Measure the paper's world-model error: mean squared error of the next step, lidar and goal apart.
+
+    Teacher-forced, and as a dream of --steps steps that starts from 16 real rows.
+    """
+    from navrep_data.cli.train import check_device, use_threads
+    from navrep_data.evaluate import world_model as measure
+    from navrep_data.zoo.local import load_any_model
+
+    if split not in ("train", "val", "test"):
+        raise ConfigError(f"--split is {split!r}, expected train, val or test.")
+    use_threads(threads)
+    check_device(device)
+    results = []
+    for name in models:
+        model: Any = load_any_model(name, source)
+        part: Any = split
+        results.append(
+            measure.world_model_error(
+                model.to(device) if hasattr(model, "to") else model, data, split=part, steps=steps, limit=limit,
+                name=name, progress=show_progress(),
+            )
+        )  # fmt: skip
+    if figure is not None:
+        measure.figure(results, figure)
+    if as_json:
+        print_json({"results": [r.to_dict() for r in results]})
+        return
+    for line in measure.table(results):
+        say(line)

@@ -1,0 +1,138 @@
+"""What a controller training consists of: one frozen dataclass, stored as JSON with the controller."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+from navrep_data.errors import ConfigError
+from navrep_data.sim import SimConfig, make_config
+from navrep_data.zoo.policy import FEATURES
+
+VALIDATION_SEEDS = range(5000, 5100)
+"""Episodes that selection looks at: never those of the test suite, 1000 to 1199."""
+AUTHORS_SEEDS = range(1000, 1100)
+AUTHORS_HELD_OUT = range(1100, 1200)
+
+
+@dataclass(frozen=True)
+class ControllerRecipe:
+    """Settings of one controller training.
+
+    Attributes
+    ----------
+    features : str
+        ``"z"``, ``"h"``, ``"zh"``, or ``"e2e"``.
+    lidar : str
+        ``"rings"`` or ``"1d"``.
+    original : bool
+        Whether these are the authors' settings; then the action is a clipped Gaussian without bounds, timeouts count
+        as ends, and selection looks at episodes 1000 to 1099.
+    steps : int
+        Steps of all worlds together.
+    worlds, rollout : int
+        Worlds, and steps of each between two updates.
+    batch, epochs : int
+        Rows per gradient step, passes over a rollout.
+    lr : float
+        Learning rate; falls linearly to 0 unless original.
+    gamma, gae_lambda, clip_range, entropy, value_weight, max_grad_norm : float
+        PPO's.
+    target_kl : float
+        An update stops where the policy moved farther; 0 = never.
+    hidden : int
+        Units per layer.
+    max_speed : float
+        Longest velocity commanded [m/s]; 0 = no limit beyond [-1, 1] on each axis.
+    physics : str
+        Of the training worlds. Validation is in original physics, as the benchmark.
+    reward_scale : float
+        Factor on rewards.
+    precision : str
+        Of the frozen encoder.
+    context : str
+        What a joint or transformer memory keeps.
+    validate_every : int
+        Steps between validations, each with a checkpoint.
+    seed : int
+        Of worlds and weights.
+    """
+
+    features: str = "z"
+    lidar: str = "rings"
+    original: bool = False
+    steps: int = 20_000_000
+    worlds: int = 256
+    rollout: int = 64
+    batch: int = 4096
+    epochs: int = 4
+    lr: float = 5e-4
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    entropy: float = 0.0
+    value_weight: float = 0.5
+    max_grad_norm: float = 0.5
+    target_kl: float = 0.03
+    hidden: int = 64
+    max_speed: float = 1.0
+    physics: str = "consistent"
+    reward_scale: float = 0.05
+    precision: str = "bfloat16"
+    context: str = "newest-32"
+    validate_every: int = 100_000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check what the parts it is passed to do not check."""
+        choices = {"features": (*FEATURES, "e2e"), "lidar": ("rings", "1d"), "precision": ("bfloat16", "float32")}
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                raise ConfigError(
+                    f"{name} is {str(getattr(self, name))[:40]!r}, expected one of: {', '.join(allowed)}."
+                )
+        for field in dataclasses.fields(self):
+            value: Any = getattr(self, field.name)
+            if field.type == "int" and (type(value) is not int or value < (0 if field.name == "seed" else 1)):
+                raise ConfigError(f"{field.name} is {str(value)[:40]}, expected a whole number of at least 1.")
+            if field.type == "float" and (type(value) not in (int, float) or not 0 <= value <= 1e6):
+                raise ConfigError(f"{field.name} is {str(value)[:40]}, expected a number of at least 0.")
+        if self.worlds * self.rollout % self.batch:
+            raise ConfigError(
+                f"batch is {self.batch}, expected a divisor of worlds x rollout = {self.worlds * self.rollout}."
+            )
+
+    def replace(self, **changes: Any) -> ControllerRecipe:
+        """Return a copy with some fields changed; None means unchanged."""
+        return dataclasses.replace(self, **{name: value for name, value in changes.items() if value is not None})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as plain JSON values."""
+        return dataclasses.asdict(self)
+
+
+def default_controller_recipe(features: str, lidar: str) -> ControllerRecipe:
+    """Return our settings; end to end with fewer worlds, since its rollouts hold whole observations."""
+    if features == "e2e":
+        return ControllerRecipe(features, lidar, worlds=128, rollout=64, batch=1024, lr=3e-4)
+    return ControllerRecipe(features, lidar)
+
+
+def original_controller_recipe(features: str, lidar: str, modular: bool = False) -> ControllerRecipe:
+    """Return the authors' settings, as all their released runs have them (MODEL_FACTS 7)."""
+    return ControllerRecipe(
+        features, lidar, original=True, steps=100_000_000 if modular else 60_000_000, worlds=6, rollout=128, batch=192,
+        epochs=4, lr=2.5e-4, entropy=0.01, target_kl=0.0, max_speed=0.0, physics="original", reward_scale=1.0,
+        precision="float32", context="oldest-32", validate_every=600_000,
+    )  # fmt: skip
+
+
+def environment(recipe: ControllerRecipe) -> SimConfig:
+    """Return the training environment: each world adapts its own difficulty."""
+    return make_config("navrep-train", physics=recipe.physics, curriculum="adaptive")
+
+
+def validation_environment() -> SimConfig:
+    """Return the environment that validation plays: that of the test suite, with other episodes."""
+    return make_config("navrep-test", physics="original")

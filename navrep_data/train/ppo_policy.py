@@ -1,0 +1,36 @@
+"""Actor and critic for PPO whose actions stay within bounds by themselves."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import Tensor
+
+LEAST_STD, MOST_STD = 0.05, 0.6
+
+
+class BoundedPolicy(ActorCriticPolicy):
+    """A normal distribution whose mean is within (-1, 1) and whose width stays between 0.05 and 0.6.
+
+    Notes
+    -----
+    The released controllers' means and widths had no bounds while the environment clipped what it executed: with an
+    entropy bonus both grew into the hundreds, and control became bang-bang (MODEL_FACTS 7).
+    """
+
+    def __init__(
+        self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], *args: Any, **kwargs: Any
+    ):
+        kwargs.setdefault("log_std_init", math.log(0.4))
+        super().__init__(observation_space, action_space, *args, **kwargs)
+
+    def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Distribution:
+        assert isinstance(self.action_dist, DiagGaussianDistribution)
+        mean = torch.tanh(self.action_net(latent_pi))
+        width = self.log_std.clamp(math.log(LEAST_STD), math.log(MOST_STD))
+        return self.action_dist.proba_distribution(mean, width)

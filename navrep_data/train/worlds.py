@@ -1,0 +1,207 @@
+"""Hundreds of worlds as one stable-baselines3 VecEnv: stepped in one call, encoded in one batch."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
+
+from navrep_data.errors import SimulationError
+from navrep_data.models.controllers import N_ACTIONS
+from navrep_data.schema import ACTION_SIZE, Event
+from navrep_data.sim import SimConfig, Simulator
+from navrep_data.zoo.policy import Policy
+
+F32 = NDArray[np.float32]
+
+
+def shorten(actions: F32, max_speed: float) -> F32:
+    """Return actions (W, 2) clipped to [-1, 1] and no longer than `max_speed` [m/s]; 0 = no limit."""
+    clipped = np.clip(actions, -1.0, 1.0)
+    if max_speed > 0.0:
+        length = np.linalg.norm(clipped, axis=1, keepdims=True)
+        clipped = clipped * (max_speed / np.maximum(length, max_speed))
+    return np.asarray(clipped, np.float32)
+
+
+class TrainingWorlds(VecEnv):
+    """Worlds of one environment, seen through a policy's encoder and memory.
+
+    Parameters
+    ----------
+    config : SimConfig
+        The environment; ``curriculum="adaptive"`` makes each world harder or easier by its own episodes.
+    policy : Policy
+        Whose encoder and memory make the observations; its controller is not used.
+    n_worlds : int
+        Worlds that step together.
+    seed : int
+        Of the worlds.
+    max_speed : float
+        As in :class:`ControllerConfig`.
+    reward_scale : float
+        Factor on the simulator's rewards.
+    truncate : bool
+        Whether timeouts are told to the learner as truncations, so that it bootstraps; the authors' software did not.
+
+    Notes
+    -----
+    With features h and zh the observation that a truncated episode ends with holds the memory of the row before it.
+    """
+
+    def __init__(
+        self,
+        config: SimConfig,
+        policy: Policy,
+        n_worlds: int,
+        *,
+        seed: int = 0,
+        max_speed: float = 0.0,
+        reward_scale: float = 1.0,
+        truncate: bool = True,
+    ) -> None:
+        self.simulator = Simulator(config, n_worlds, seed=seed)
+        self.policy, self.max_speed, self.reward_scale, self.truncate = policy, max_speed, reward_scale, truncate
+        self._actions = np.zeros((n_worlds, N_ACTIONS), np.float32)
+        self._returns, self._lengths = np.zeros(n_worlds), np.zeros(n_worlds, np.int64)
+        self._last = np.zeros((n_worlds, policy.n_inputs), np.float32)
+        self._start = time.time()
+        self.outcomes: list[Event] = []
+        self.seconds = {"simulate": 0.0, "encode": 0.0}
+        super().__init__(
+            n_worlds,
+            spaces.Box(-np.inf, np.inf, (policy.n_inputs,), np.float32),
+            spaces.Box(-1.0, 1.0, (N_ACTIONS,), np.float32),
+        )
+
+    def reset(self) -> F32:
+        """Start an episode in every world."""
+        self.simulator.reset()
+        self._returns[:], self._lengths[:] = 0.0, 0
+        self.policy.reset(batch_size=self.num_envs)
+        scan, state = self.simulator.observe()
+        self._last = self.policy.encode(scan, state)
+        return self._last.copy()
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Take the actions of the next step."""
+        self._actions = np.asarray(actions, np.float32)
+
+    def step_wait(self) -> tuple[F32, F32, NDArray[np.bool_], list[dict[str, Any]]]:
+        """Step all worlds; those whose episode ends start the next one."""
+        began = time.perf_counter()
+        velocity = shorten(self._actions, self.max_speed)
+        commands = np.zeros((self.num_envs, ACTION_SIZE))
+        commands[:, :N_ACTIONS] = velocity
+        rewards, events = self.simulator.step(commands)
+        done = events != Event.NONE
+        self._returns += rewards
+        self._lengths += 1
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        cut = np.flatnonzero(events == Event.TIMEOUT) if self.truncate else np.zeros(0, np.int64)
+        ends = self.simulator.observe() if len(cut) else None
+        if done.any():
+            self._finish(np.flatnonzero(done), events, infos)
+            self.simulator.reset(done)
+        scan, state = self.simulator.observe()
+        middle = time.perf_counter()
+        if ends is not None:
+            for world, features in zip(cut, self._ends(ends[0][cut], ends[1][cut], self._last[cut]), strict=True):
+                infos[world]["terminal_observation"] = features
+                infos[world]["TimeLimit.truncated"] = True
+        self.policy.observe(velocity)
+        if done.any():
+            self.policy.reset(mask=done)
+        self._last = self.policy.encode(scan, state)
+        self.seconds["simulate"] += middle - began
+        self.seconds["encode"] += time.perf_counter() - middle
+        return self._last.copy(), (rewards * self.reward_scale).astype(np.float32), done, infos
+
+    def _finish(self, worlds: NDArray[np.int64], events: NDArray[np.uint8], infos: list[dict[str, Any]]) -> None:
+        now = round(time.time() - self._start, 6)
+        for world in worlds:
+            event = Event(int(events[world]))
+            self.outcomes.append(event)
+            infos[world]["episode"] = {"r": float(self._returns[world]), "l": int(self._lengths[world]), "t": now}
+            infos[world]["event"] = event.label
+            # stable-baselines3 wants one for every end, and looks at those of truncated episodes only
+            infos[world]["terminal_observation"] = self._last[world]
+        self._returns[worlds], self._lengths[worlds] = 0.0, 0
+
+    def _ends(self, scan: F32, state: F32, before: F32) -> F32:
+        """Return the observations that truncated episodes end with."""
+        fresh, _ = self.policy.look(scan, state)
+        n_memory = self.policy.world_model.h_size if self.policy.world_model is not None else 0
+        return np.concatenate([fresh, before[:, before.shape[1] - n_memory :]], axis=1) if n_memory else fresh
+
+    # --- what VecEnv asks for ----------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute for each of the worlds asked for; they share it."""
+        return [getattr(self, attr_name, None)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refuse: worlds have no attributes of their own."""
+        raise SimulationError(f"{attr_name!r} cannot be set for single worlds of a batch.")
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Refuse: worlds have no methods of their own."""
+        raise SimulationError(f"{method_name!r} cannot be called on single worlds of a batch.")
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        """Return False for each world asked for: the statistics are those of the simulator."""
+        return [False] * len(list(self._get_indices(indices)))
+
+    def take_outcomes(self) -> dict[str, float]:
+        """Return the shares of the outcomes since the last call, and forget them."""
+        events, self.outcomes = self.outcomes, []
+        n = max(1, len(events))
+        return {
+            "episodes": float(len(events)),
+            "success": sum(e == Event.GOAL for e in events) / n,
+            "collision": sum(e in (Event.COLLISION_HUMAN, Event.COLLISION_OBSTACLE) for e in events) / n,
+            "timeout": sum(e == Event.TIMEOUT for e in events) / n,
+        }
+
+
+def play(policy: Policy, config: SimConfig, numpy_seeds: Sequence[int]) -> list[Event]:
+    """Let a policy drive numbered episodes, side by side, each to its end.
+
+    Parameters
+    ----------
+    policy : Policy
+        Acts deterministically.
+    config : SimConfig
+        Environment.
+    numpy_seeds : sequence of int
+        One per episode, see :meth:`Simulator.reset_seeded`.
+
+    Returns
+    -------
+    list of Event
+        How each ended.
+    """
+    n = len(numpy_seeds)
+    simulator = Simulator(config, n)
+    simulator.reset_seeded(np.asarray(numpy_seeds))
+    policy.reset(batch_size=n)
+    ended = np.zeros(n, np.uint8)
+    most = int(np.ceil(config.time_limit / config.sensor.dt)) + 2
+    for _ in range(most):
+        scan, state = simulator.observe()
+        action: Any = policy.act(scan, state)
+        command = action.numpy() if isinstance(action, Tensor) else action
+        _, events = simulator.step(np.where((ended == 0)[:, None], command, 0.0))
+        ended = np.where(ended == 0, events, ended)
+        if (ended != 0).all():
+            break
+    return [Event(int(e)) for e in ended]

@@ -1,0 +1,102 @@
+"""Models by name or by folder: what a command line's NAME|DIR stands for."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from navrep_data.errors import CheckpointError, CorruptDataError
+from navrep_data.io import read_json
+from navrep_data.schema import SensorContract
+
+POLICY_FILE = "policy.json"
+"""Beside a controller's weights: what it sees through."""
+PARTS = "world_model"
+"""Folder beside a controller's weights that holds its world model or V."""
+_MAX_JSON = 1 << 16
+
+
+def is_folder(name: str | os.PathLike[str]) -> bool:
+    """Return whether NAME|DIR means a path: it has a separator, is absolute, or exists as a file or folder."""
+    text = os.fspath(name)
+    return os.sep in text or text.endswith((".safetensors", ".json")) or Path(text).is_dir()
+
+
+def load_any_model(name: str | os.PathLike[str], source: str | os.PathLike[str] | None = None, **options: Any) -> Any:
+    """Load a model of the zoo by name, or a checkpoint by its folder.
+
+    Parameters
+    ----------
+    name : str or path-like
+        Name such as ``transformer_1d.released``, or a folder with ``model.safetensors`` and ``config.json``: a
+        checkpoint of :mod:`navrep_data.models.checkpoint`, or what ``navrep-data train`` wrote.
+    source : path-like or str, optional
+        Where names are looked for, see :func:`navrep_data.zoo.load`.
+    **options
+        For names: passed on to :func:`navrep_data.zoo.load`.
+
+    Returns
+    -------
+    torch.nn.Module or navrep_data.zoo.policy.Policy
+
+    Raises
+    ------
+    CheckpointError
+        If the folder holds no checkpoint.
+    UnknownNameError, CorruptDataError, OfflineError, DownloadError
+        As :func:`navrep_data.zoo.load`.
+    """
+    if not is_folder(name):
+        from navrep_data import zoo
+
+        return zoo.load(os.fspath(name), source, **options)
+    path = Path(name)
+    if not path.exists():
+        raise CheckpointError(
+            f"There is no {path}; expected a folder with model.safetensors, or a name: navrep-data models"
+        )
+    if (path / POLICY_FILE).is_file():
+        return load_policy(path, **options)
+    from navrep_data.models import checkpoint
+
+    return checkpoint.load(path)
+
+
+def load_policy(folder: Path, **options: Any) -> Any:
+    """Return the policy in a folder that ``navrep-data train controller`` or ``train e2e`` wrote.
+
+    Parameters
+    ----------
+    folder : Path
+        With ``policy.json``, the controller's checkpoint, and its world model in a folder of its own.
+    **options
+        Passed on to :class:`navrep_data.zoo.policy.Policy`.
+
+    Raises
+    ------
+    CorruptDataError
+        If ``policy.json`` is not what training writes.
+    CheckpointError
+        If a checkpoint is missing or does not fit.
+    """
+    from navrep_data.models import VAE, ActorCritic, WorldModel, checkpoint
+    from navrep_data.zoo.policy import Policy
+
+    found = read_json(folder / POLICY_FILE, _MAX_JSON)
+    try:
+        features, lidar, context, part = (found[key] for key in ("features", "lidar", "context", "world_model"))
+        sensor = SensorContract(**found["sensor"])
+        if part not in (None, PARTS):
+            raise ValueError(f"world_model {str(part)[:40]!r}")
+    except (KeyError, TypeError, ValueError) as error:
+        raise CorruptDataError(f"{folder / POLICY_FILE} lacks or garbles a field ({error!r}); get it again.") from error
+    network = checkpoint.load(folder)
+    if not isinstance(network, ActorCritic):
+        raise CheckpointError(f"{folder} holds a {type(network).__name__}, expected a controller.")
+    model = None if part is None else checkpoint.load(folder / PARTS)
+    world_model = model if isinstance(model, WorldModel) and features != "z" else None
+    vae = model if isinstance(model, VAE) else getattr(model, "vae", None)
+    return Policy(
+        network, features, lidar, vae, world_model, context=context, sensor=sensor, **{"name": folder.name, **options}
+    )

@@ -1,0 +1,237 @@
+"""Controllers: the batch of worlds, PPO for a few steps, what it leaves, bad input."""
+
+import numpy as np
+import pytest
+import torch
+
+from navrep_data.errors import CheckpointError, ConfigError, DatasetMismatchError
+from navrep_data.models import Controller, ControllerConfig, checkpoint
+from navrep_data.models.controllers import limit_speed
+from navrep_data.schema import Event
+from navrep_data.sim import Simulator, make_config
+from navrep_data.train import controllers
+from navrep_data.train.controller_recipe import (
+    AUTHORS_SEEDS,
+    VALIDATION_SEEDS,
+    default_controller_recipe,
+    environment,
+    original_controller_recipe,
+)
+from navrep_data.train.logs import read_log
+from navrep_data.train.worlds import TrainingWorlds, play, shorten
+from navrep_data.zoo.local import load_any_model
+from navrep_data.zoo.policy import Policy
+
+SMALL = {"worlds": 8, "rollout": 8, "batch": 32, "steps": 128, "validate_every": 64}
+
+
+def world_model(lidar="1d", alignment="taken"):
+    torch.manual_seed(0)
+    settings = {"lidar": lidar, "z_size": 16, "n_blocks": 1, "n_heads": 2, "action_alignment": alignment}
+    return checkpoint.make("transformer", settings).eval()
+
+
+@pytest.fixture
+def few_episodes(monkeypatch):
+    monkeypatch.setattr(controllers, "VALIDATION_SEEDS", range(5000, 5003))
+    monkeypatch.setattr(controllers, "AUTHORS_SEEDS", range(1000, 1002))
+    monkeypatch.setattr(controllers, "AUTHORS_HELD_OUT", range(1100, 1102))
+
+
+def test_selection_never_looks_at_the_test_suite():
+    assert not set(VALIDATION_SEEDS) & set(range(1000, 1200))
+    assert (len(VALIDATION_SEEDS), VALIDATION_SEEDS[0]) == (100, 5000)
+    assert (AUTHORS_SEEDS.start, AUTHORS_SEEDS.stop) == (1000, 1100)  # their own selection, by --original only
+
+
+def test_worlds_are_the_simulators_with_their_codes():
+    model = world_model()
+    policy = Policy(Controller(ControllerConfig(21)), "z", "1d", None, model)
+    config = make_config("navrep-train", curriculum="adaptive")
+    worlds = TrainingWorlds(config, policy, 4, seed=3, max_speed=1.0, reward_scale=0.5)
+    twin = Simulator(config, 4, seed=3)
+    obs = worlds.reset()
+    twin.reset()
+    rng = np.random.default_rng(0)
+    ends = 0
+    for _ in range(200):
+        scan, state = twin.observe()
+        with torch.no_grad():
+            z = model.encode(model.observation(scan)).numpy()
+        np.testing.assert_allclose(obs, np.concatenate([z, state], axis=1), rtol=1e-4, atol=1e-4)
+        actions = rng.uniform(-2, 2, (4, 2)).astype(np.float32)
+        worlds.step_async(actions)
+        obs, rewards, done, infos = worlds.step_wait()
+        command = np.zeros((4, 3))
+        command[:, :2] = shorten(actions, 1.0)
+        expected, events = twin.step(command)
+        np.testing.assert_allclose(rewards, expected * 0.5, rtol=1e-5)
+        assert (done == (events != 0)).all()
+        for w in np.flatnonzero(done):
+            ends += 1
+            assert infos[w]["event"] == Event(int(events[w])).label
+            assert infos[w].get("TimeLimit.truncated", False) == (events[w] == Event.TIMEOUT)
+            if events[w] == Event.TIMEOUT:
+                last_scan, last_state = twin.observe()
+                last = np.concatenate([model.encode(model.observation(last_scan)).detach().numpy(), last_state], axis=1)
+                np.testing.assert_allclose(infos[w]["terminal_observation"], last[w], rtol=1e-4, atol=1e-4)
+        twin.reset(done)
+    assert ends > 3
+    assert worlds.take_outcomes()["episodes"] == ends
+    assert (worlds.simulator.difficulty() <= [5, 10]).all()
+
+
+def test_speed_limit_in_numpy_and_torch_agree():
+    actions = np.array([[0.3, 0.1], [3.0, 0.0], [1.0, 1.0], [-1.0, 0.5], [0.0, 0.0]], np.float32)
+    found = shorten(actions, 1.0)
+    assert np.linalg.norm(found, axis=1).max() <= 1 + 1e-6
+    np.testing.assert_allclose(found[2], [0.5**0.5] * 2, rtol=1e-6)
+    clipped = torch.tensor(actions).clamp(-1, 1)
+    np.testing.assert_allclose(limit_speed(clipped, 1.0).numpy(), found, rtol=1e-6)
+    np.testing.assert_array_equal(shorten(actions, 0.0), clipped.numpy())
+
+
+@pytest.mark.parametrize("features", ["z", "zh"])
+def test_a_few_steps_leave_a_policy_that_loads_and_drives(features, few_episodes, tmp_path):
+    model = world_model()
+    recipe = default_controller_recipe(features, "1d").replace(**SMALL)
+    done = controllers.train_controller(recipe, tmp_path / "c", model=model, model_name="W")
+    assert (done.steps, done.held_out) == (128, None)
+    policy = load_any_model(tmp_path / "c")
+    assert (policy.features, policy.lidar, policy.network.config.squash) == (features, "1d", "tanh")
+    simulator = Simulator(environment(recipe), 5, seed=1)
+    policy.reset(batch_size=5)
+    for _ in range(3):
+        action = policy.act(*simulator.observe())
+        assert action.shape == (5, 3)
+        assert np.linalg.norm(action, axis=1).max() <= 1 + 1e-6
+        simulator.step(action)
+    log = read_log(tmp_path / "c")
+    assert {"success", "policy_std", "humans"} <= set(log[0])
+    assert [r["step"] for r in log if "val_success" in r] == ["64", "128"]
+    assert (tmp_path / "c" / "training.png").is_file()
+    metadata = checkpoint.read_config(tmp_path / "c")["metadata"]
+    assert "5000" in metadata["selected_on"]
+
+
+def test_ppo_moves_actor_critic_and_width_and_nothing_of_the_encoder(few_episodes, tmp_path):
+    model = world_model()
+    before = {name: p.clone() for name, p in model.named_parameters()}
+    recipe = default_controller_recipe("z", "1d").replace(**{**SMALL, "steps": 64})
+    controllers.train_controller(recipe, tmp_path / "a", model=model, stop_after=64)
+    first = checkpoint.load(tmp_path / "a" / "checkpoints" / "step-00000064")
+    controllers.train_controller(recipe.replace(lr=1e-9), tmp_path / "b", model=model, stop_after=64)
+    still = checkpoint.load(tmp_path / "b" / "checkpoints" / "step-00000064")
+    for name, p in first.named_parameters():
+        moved = float((p - dict(still.named_parameters())[name]).detach().abs().max())
+        assert (moved > 1e-5) == (not name.startswith("q.")), name
+    assert all(torch.equal(p, before[name]) for name, p in model.named_parameters())
+
+
+def test_resume_goes_on_and_refuses_other_settings(few_episodes, tmp_path):
+    model, out = world_model(), tmp_path / "c"
+    recipe = default_controller_recipe("z", "1d").replace(**SMALL)
+    controllers.train_controller(recipe, out, model=model, stop_after=64)
+    with pytest.raises(ConfigError, match=r"started with max_speed = 1\.0, this resume has 2.0"):
+        controllers.train_controller(recipe.replace(max_speed=2.0), out, model=model, resume=True)
+    other = checkpoint.make("transformer", {**model.config.to_dict(), "n_blocks": 2})
+    with pytest.raises(DatasetMismatchError, match="world_model_sha256"):
+        controllers.train_controller(recipe, out, model=other, resume=True)
+    done = controllers.train_controller(recipe, out, model=model, resume=True)
+    assert done.steps == 128
+    assert [r["step"] for r in read_log(out) if "val_success" in r] == ["64", "128"]
+
+
+def test_the_authors_settings_run_and_report_the_episodes_they_did_not_select_on(few_episodes, tmp_path):
+    recipe = original_controller_recipe("z", "1d")
+    assert (recipe.worlds, recipe.rollout, recipe.batch, recipe.entropy, recipe.steps) == (
+        6,
+        128,
+        192,
+        0.01,
+        60_000_000,
+    )
+    short = recipe.replace(rollout=32, validate_every=192, steps=192)
+    done = controllers.train_controller(short, tmp_path / "c", model=world_model(alignment="leading"))
+    assert done.held_out is not None
+    assert checkpoint.load(tmp_path / "c").config.squash == "clip"
+
+
+def test_end_to_end(few_episodes, tmp_path):
+    recipe = default_controller_recipe("e2e", "1d").replace(**{**SMALL, "steps": 64})
+    controllers.train_controller(recipe, tmp_path / "c")
+    policy = load_any_model(tmp_path / "c")
+    assert policy.act(*Simulator(environment(recipe), 3, seed=1).observe()).shape == (3, 3)
+
+
+def test_a_network_is_continued(few_episodes, tmp_path):
+    model = world_model()
+    torch.manual_seed(5)
+    network = Controller(ControllerConfig(21)).eval()
+    init = Policy(network, "z", "1d", None, model, name="given")
+    before = {name: p.clone() for name, p in network.named_parameters()}
+    recipe = default_controller_recipe("z", "1d").replace(**{**SMALL, "steps": 64, "lr": 1e-9})
+    controllers.train_controller(recipe, tmp_path / "c", model=model, init=init)
+    trained = checkpoint.load(tmp_path / "c")
+    assert trained.config.squash == "clip"  # it keeps its own bounds
+    for name, p in trained.named_parameters():
+        torch.testing.assert_close(p, before[name], rtol=1e-4, atol=1e-6)
+    with pytest.raises(CheckpointError, match="do not fit"):
+        controllers.train_controller(recipe.replace(features="zh"), tmp_path / "d", model=model, init=init)
+
+
+def test_bad_input(tmp_path):
+    recipe = default_controller_recipe("h", "1d").replace(**SMALL)
+    for model, words in (
+        (checkpoint.make("vae", {"lidar": "1d"}), "need a memory"),
+        (world_model("rings"), "reads rings, expected 1d"),
+        (checkpoint.make("memory", {}), "without a V"),
+    ):
+        with pytest.raises(ConfigError, match=words) as error:
+            controllers.train_controller(recipe, tmp_path / "c", model=model)
+        assert "\n" not in str(error.value)
+    with pytest.raises(ConfigError, match="divisor of worlds x rollout"):
+        recipe.replace(batch=33)
+    assert not (tmp_path / "c").exists()
+
+
+def test_memory_that_is_fed_the_action_taken_lags_by_one_row():
+    model = world_model()
+    policy = Policy(Controller(ControllerConfig(21)), "h", "1d", None, model, context="newest-32")
+    simulator = Simulator(make_config("navrep-train"), 2, seed=0)
+    rows, actions, found = [], [], []
+    policy.reset(batch_size=2)
+    rng = np.random.default_rng(0)
+    for t in range(5):
+        scan, state = simulator.observe()
+        if t == 3:
+            policy.reset(mask=np.array([False, True]))
+        found.append(policy.encode(scan, state)[:, 5:])
+        action = np.zeros((2, 3), np.float32)
+        action[:, :2] = rng.uniform(-1, 1, (2, 2))
+        policy.observe(action)
+        simulator.step(action)
+        rows.append((scan, state))
+        actions.append(action)
+    with torch.no_grad():
+        z = torch.stack([model.encode(model.observation(s)) for s, _ in rows], 1)
+        goal = torch.stack([torch.tensor(state[:, :2]) for _, state in rows], 1)
+        taken = torch.stack([torch.tensor(a) for a in actions], 1)
+        whole, _ = model.hidden(z, goal, taken)
+        second, _ = model.hidden(z[1:, 3:], goal[1:, 3:], taken[1:, 3:])
+    assert not found[0].any()
+    for t in range(1, 5):
+        np.testing.assert_allclose(found[t][0], whole[0, t - 1].numpy(), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(found[2][1], whole[1, 1].numpy(), rtol=1e-4, atol=1e-5)
+    assert not found[3][1].any()
+    np.testing.assert_allclose(found[4][1], second[0, 0].numpy(), rtol=1e-4, atol=1e-5)
+
+
+def test_play_counts_each_episode_once():
+    model = world_model()
+    torch.manual_seed(0)
+    policy = Policy(Controller(ControllerConfig(21)), "z", "1d", None, model)
+    config = make_config("navrep-test", physics="original")
+    both = play(policy, config, [5000, 5001, 5002])
+    assert all(event != Event.NONE for event in both)
+    assert [play(policy, config, [seed])[0] for seed in (5000, 5001, 5002)] == both

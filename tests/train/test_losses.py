@@ -1,0 +1,148 @@
+"""Losses against slow, plain formulas."""
+
+import math
+
+import pytest
+import torch
+
+from navrep_data.models import MDNRNN, MemoryConfig, Mixture, Noise, TransformerConfig, TransformerWorldModel
+from navrep_data.train import default_recipe, original_recipe
+from navrep_data.train.losses import (
+    Counts,
+    divergence,
+    mixture_nll,
+    observation_loss,
+    restart_loss,
+    run_with_restarts,
+    world_model_loss,
+)
+from navrep_data.train.optim import decaying, learning_rate
+
+
+def test_mixture_nll_is_that_of_a_sum_of_normals():
+    torch.manual_seed(0)
+    mixture = Mixture(torch.log_softmax(torch.randn(3, 5), -1), torch.randn(3, 5), torch.randn(3, 5), torch.zeros(3))
+    x = torch.randn(3)
+    for d in range(3):
+        density = 0.0
+        for k in range(5):
+            width = math.exp(float(mixture.logstd[d, k]))
+            away = (float(x[d]) - float(mixture.mean[d, k])) / width
+            density += (
+                math.exp(float(mixture.logmix[d, k])) * math.exp(-0.5 * away**2) / (width * math.sqrt(2 * math.pi))
+            )
+        assert float(mixture_nll(mixture, x)[d]) == pytest.approx(-math.log(density), rel=1e-5)
+
+
+def test_restart_loss_weighs_restarts_tenfold():
+    logit, target = torch.tensor([0.3, 0.3]), torch.tensor([1.0, 0.0])
+    p = 1 / (1 + math.exp(-0.3))
+    found = restart_loss(logit, target, 10.0)
+    assert found.tolist() == pytest.approx([-10 * math.log(p), -math.log(1 - p)], rel=1e-5)
+
+
+def test_divergence_and_floors_follow_the_authors():
+    mu, logvar = torch.tensor([[1.0, 0.0]]), torch.tensor([[0.0, 1.0]])
+    each = [-0.5 * (1 + 0 - 1 - 1), -0.5 * (1 + 1 - 0 - math.e)]
+    v, joint = original_recipe("v", "rings"), original_recipe("joint", "rings")
+    assert float(divergence(mu, logvar, v)) == pytest.approx(sum(each))
+    assert float(divergence(mu, logvar, joint)) == pytest.approx(sum(each) / 2)
+    assert (v.kl_weight, v.kl_floor, joint.kl_weight, joint.kl_floor) == (1.0, 16.0, 0.001, 0.5)
+
+
+def test_observation_losses():
+    logits, target = torch.randn(2, 64, 64), torch.rand(2, 64, 64)
+    p = torch.sigmoid(logits.double())
+    t = target.double()
+    bce = -(t * p.log() + (1 - t) * (1 - p).log()).mean((1, 2))
+    torch.testing.assert_close(observation_loss(logits, target, "cross_entropy").double(), bce, rtol=1e-4, atol=1e-5)
+    squared = ((p - t) ** 2).sum((1, 2))
+    torch.testing.assert_close(observation_loss(logits, target, "squared_sum").double(), squared, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_the_state_goes_back_to_the_fed_one_at_restarts(given):
+    torch.manual_seed(0)
+    m = MDNRNN(MemoryConfig(z_size=4, h_size=8))
+    inputs = torch.randn(3, 9, m.n_inputs + 1)
+    restart = torch.zeros(3, 9, dtype=torch.bool)
+    restart[0, 4] = restart[0, 5] = restart[2, 8] = True
+    mask = torch.ones(3, 9, dtype=torch.bool)
+    state = (torch.randn(1, 3, 8), torch.randn(1, 3, 8)) if given else None
+    h, after = run_with_restarts(m, inputs, restart, mask, state)
+    start = (torch.zeros(1, 3, 8), torch.zeros(1, 3, 8)) if state is None else state
+    for b in range(3):
+        now = tuple(s[:, b : b + 1].contiguous() for s in start)
+        for t in range(9):
+            if restart[b, t]:
+                now = tuple(s[:, b : b + 1].contiguous() for s in start)
+            out, now = m.lstm(inputs[b : b + 1, t : t + 1], now)
+            torch.testing.assert_close(h[b, t], out[0, 0], rtol=1e-5, atol=1e-6)
+        for kept, last in zip(after, now, strict=True):
+            torch.testing.assert_close(kept[:, b], last[:, 0], rtol=1e-5, atol=1e-6)
+
+
+def batch_of(n, t, rows):
+    mask = torch.arange(t) < torch.tensor(rows)[:, None]
+    next_mask = torch.arange(t) < torch.tensor(rows)[:, None] - 1
+    return {
+        "obs": torch.rand(n, t, 1080), "next_obs": torch.rand(n, t, 1080), "mask": mask, "next_mask": next_mask,
+        "goal_mask": next_mask, "goal": torch.randn(n, t, 2), "next_goal": torch.randn(n, t, 2),
+        "action": torch.randn(n, t, 3), "reconstruct": torch.ones(n, t, dtype=torch.bool),
+        "predict": torch.ones(n, t, dtype=torch.bool),
+    }  # fmt: skip
+
+
+def test_the_parts_of_a_batch_add_up_to_it_and_padding_does_not_count():
+    from navrep_data.train.data import part
+
+    torch.manual_seed(0)
+    model = TransformerWorldModel(TransformerConfig("1d", 16, 1, 2, 4))
+    recipe = default_recipe("transformer", "1d").replace(precision="float32", kl_warmup=0)
+    batch = batch_of(4, 4, [4, 2, 1, 3])
+    counts = Counts(10, 6, 10, 6)
+
+    def loss(first, stop):
+        return float(world_model_loss(model, part(batch, first, stop), recipe, 0, None, counts).total.detach())
+
+    whole = loss(0, 4)
+    parts = loss(0, 2) + loss(2, 4)
+    assert parts == pytest.approx(whole, rel=1e-5)
+    for name in ("obs", "next_obs", "goal", "next_goal", "action"):
+        away = ~batch["mask"] if name in ("obs", "goal", "action") else ~batch["next_mask"]
+        batch[name][away] = 1e3
+    assert loss(0, 4) == pytest.approx(whole, rel=1e-5)
+
+
+def test_gradients_reach_every_weight_of_a_transformer():
+    from navrep_data.train.data import part
+
+    torch.manual_seed(0)
+    model = TransformerWorldModel(TransformerConfig("1d", 16, 2, 2, 4))
+    recipe = default_recipe("transformer", "1d")
+    batch = part(batch_of(2, 4, [4, 4]), 0, 2)
+    world_model_loss(model, batch, recipe, 0, Noise.seeded(0), Counts(8, 6, 8, 6)).total.backward()
+    without = [n for n, p in model.named_parameters() if p.grad is None or not bool(p.grad.abs().sum() > 0)]
+    # softmax does not see what is added to all its inputs alike
+    assert [n for n in without if not n.endswith("attn.key.bias")] == []
+
+
+def test_only_matrices_decay_by_default_and_nearly_all_by_the_authors():
+    model = TransformerWorldModel(TransformerConfig("1d", 16, 1, 2, 4))
+    ours, theirs = decaying(model, "matrices"), decaying(model, "authors")
+    assert not any("bias" in n or ".ln" in n or n in ("pos_emb", "ln_f.weight") for n in ours)
+    assert {"pos_emb", "ln_f.weight", "blocks.0.ln1.weight", "vae.encoder.0.weight"} <= theirs
+    assert "vae.encoder.0.weight" in ours
+
+
+def test_the_authors_schedules():
+    w, m = original_recipe("transformer", "rings"), original_recipe("m", "rings")
+    assert learning_rate(w, 0, 0, 1000) == 6e-4
+    assert learning_rate(w, 1, 5120, 10**6) == pytest.approx(3e-4)
+    assert learning_rate(w, 99, 200 * 10**6, 10**6) == pytest.approx(6e-5)  # the end of 200 epochs
+    assert learning_rate(w, 999, 400 * 10**6 - 10_240, 10**6) == pytest.approx(6e-4, rel=1e-3)  # cyclic: up again
+    assert learning_rate(m, 0, 0, 1) == 1e-3
+    assert learning_rate(m, 100_000, 0, 1) == pytest.approx((1e-3 - 1e-5) * 0.99999**100_000 + 1e-5)
+    ours = default_recipe("transformer", "rings")
+    assert learning_rate(ours, 0, 0, 1) == pytest.approx(ours.lr / ours.warmup)
+    assert learning_rate(ours, ours.steps, 0, 1) == pytest.approx(ours.lr_end)

@@ -1,0 +1,40 @@
+"""V's fast passes against the plain modules: values and gradients."""
+
+import pytest
+import torch
+
+from navrep_data.models import VAE, VAEConfig
+from navrep_data.train import passes
+
+
+def gradients(vae, loss):
+    vae.zero_grad()
+    loss.backward()
+    return {name: p.grad.clone() for name, p in vae.named_parameters()}
+
+
+@pytest.mark.parametrize(("lidar", "shape"), [("rings", (64, 64)), ("1d", (1080,))])
+def test_values_and_gradients_are_those_of_the_plain_network(lidar, shape):
+    torch.manual_seed(0)
+    vae, obs, z = VAE(VAEConfig(lidar, 8)), torch.rand(2, *shape), torch.randn(2, 8)
+    mu, logvar = vae.distribution(obs)
+    logits = vae.decode_logits(z + mu)
+    fast_mu, fast_logvar = passes.distribution(vae, obs, torch.float32)
+    fast_logits = passes.decode_logits(vae, z + fast_mu, torch.float32)
+    for plain, fast in ((mu, fast_mu), (logvar, fast_logvar), (logits, fast_logits)):
+        torch.testing.assert_close(fast, plain, rtol=1e-4, atol=1e-5)
+    expected = gradients(vae, mu.square().sum() + logvar.sum() + logits.square().sum())
+    found = gradients(vae, fast_mu.square().sum() + fast_logvar.sum() + fast_logits.square().sum())
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, rtol=1e-3, atol=1e-4 * float(value.abs().max()))
+
+
+@pytest.mark.parametrize(("lidar", "shape"), [("rings", (64, 64)), ("1d", (1080,))])
+def test_bfloat16_is_near(lidar, shape):
+    torch.manual_seed(0)
+    vae, obs = VAE(VAEConfig(lidar, 8)), torch.rand(2, *shape)
+    mu, _ = vae.distribution(obs)
+    fast, _ = passes.distribution(vae, obs, torch.bfloat16)
+    assert fast.dtype == torch.float32
+    assert float((fast - mu).abs().max()) < 0.05 * float(mu.abs().max())
+    assert not torch.equal(fast, mu)
