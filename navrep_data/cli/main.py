@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from navrep_data._version import __version__
-from navrep_data.cli import generate, import_npz, info, models, verify
+from navrep_data.cli import generate, import_npz, info, models, verify, view
 from navrep_data.errors import NavrepDataError, did_you_mean
 
 app = typer.Typer(
@@ -24,6 +24,7 @@ app.command("generate")(generate.generate_command)
 app.command("info")(info.info_command)
 app.command("verify")(verify.verify_command)
 app.command("import-npz")(import_npz.import_npz_command)
+app.command("view")(view.view_command)
 app.add_typer(models.models_app, name="models")
 
 # Newer typers carry their own click; these are the classes that the installed one raises, whichever that is.

@@ -61,6 +61,7 @@ def dataset_page(
     sequences: Sequence[int] | None = None,
     *,
     max_bytes: int = DEFAULT_MAX_BYTES,
+    title: str | None = None,
 ) -> Page:
     """Return a page that plays sequences of a dataset.
 
@@ -73,6 +74,8 @@ def dataset_page(
     max_bytes : int
         Largest size of the page. Sequences are cut at the end, and then left out, until they fit; what was left out
         is in `Page.notes` and on the page.
+    title : str, optional
+        The folder's name by default.
 
     Returns
     -------
@@ -87,14 +90,15 @@ def dataset_page(
     """
     if max_bytes < MIN_MAX_BYTES:
         raise ConfigError(f"max_bytes is {max_bytes}, expected at least {MIN_MAX_BYTES:,}.")
-    with DatasetFolder(root) as folder:
+    name = Path(root).resolve().name if title is None else title
+    with DatasetFolder(Path(root)) as folder:
         chosen = _choose(folder.manifest, sequences, Path(root))
         notes: list[str] = []
         if sequences is None and folder.manifest.sequences > len(chosen):
             notes.append(f"{len(chosen)} of {folder.manifest.sequences:,} sequences; choose others with --sequence")
         shown: list[dict[str, Any]] = []
         blobs: list[str] = []
-        room = max_bytes - len(assemble("dataset", _meta(folder.manifest, root, [], notes), []))
+        room = max_bytes - len(assemble("dataset", _meta(folder.manifest, name, [], notes), []))
         for k, number in enumerate(chosen):
             # what is left is shared out evenly; sequences that need less leave more to the others
             entry, text = _fit(_read(folder, number, notes), room // (len(chosen) - k), folder.manifest, notes)
@@ -105,7 +109,7 @@ def dataset_page(
                 room -= len(text) + len(str(entry)) + 200
         if not shown:
             raise ConfigError(f"Not one row of {root} fits into {max_bytes:,} bytes; give more with --max-mb.")
-        html = assemble("dataset", _meta(folder.manifest, root, shown, notes), blobs)
+        html = assemble("dataset", _meta(folder.manifest, name, shown, notes), blobs)
     return Page(html, tuple(notes))
 
 
@@ -289,9 +293,7 @@ def _pack_polygons(
         blob.add("corners", np.concatenate(corners).T, MILLIMETRE)
 
 
-def _meta(
-    manifest: Manifest, root: str | os.PathLike[str], shown: list[dict[str, Any]], notes: list[str]
-) -> dict[str, Any]:
+def _meta(manifest: Manifest, title: str, shown: list[dict[str, Any]], notes: list[str]) -> dict[str, Any]:
     """Return what the page's script reads."""
     policy = manifest.policy.get("name", "unknown")
     rows = sum(entry["rows"] for entry in shown)
@@ -308,7 +310,7 @@ def _meta(
     edges = [round(float(e), 4) for e in RING_EDGES[:-1]]
     return {
         "kind": "dataset",
-        "title": clip(Path(root).resolve().name, 100),
+        "title": clip(title, 100),
         "facts": [[name, clip(value)] for name, value in facts.items()],
         "sensor": manifest.sensor.to_dict(),
         "rings": {"shape": list(RINGS_SHAPE), "edges": edges},

@@ -74,11 +74,13 @@ class Blob:
     arrays : dict of str to dict
         What the page has to know of each array: ``type`` (``"u8"``, ``"u16"``), ``shape``, ``at`` (its first byte in
         the stream), ``origin``, ``step``. Plain JSON values.
+    parts : list of bytes
+        The arrays' bytes, in order.
     """
 
     def __init__(self) -> None:
         self.arrays: dict[str, dict[str, Any]] = {}
-        self._parts: list[bytes] = []
+        self.parts: list[bytes] = []
         self._size = 0
 
     @property
@@ -102,10 +104,10 @@ class Blob:
 
     def _add(self, name: str, kind: str, shape: tuple[int, ...], data: bytes, origin: float, step: float) -> None:
         self.arrays[name] = {"type": kind, "shape": list(shape), "at": self._size, "origin": origin, "step": step}
-        self._parts.append(data)
+        self.parts.append(data)
         self._size += len(data)
 
     def base64(self) -> str:
         """Return the stream, deflated (no header), in base64."""
-        packed = bytes(deflate.deflate_compress(b"".join(self._parts), _LEVEL))
+        packed = bytes(deflate.deflate_compress(b"".join(self.parts), _LEVEL))
         return base64.b64encode(packed).decode("ascii")

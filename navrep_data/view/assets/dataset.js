@@ -145,7 +145,7 @@ function showRow(row) {
   for (const panel of panels) panel.paint();
   $('slider').value = String(row);
   $('slider').setAttribute('aria-valuetext', `row ${row}, episode ${episode.episode}, step ${step}`);
-  $('clock').textContent = `row ${row} of ${s.rows} · episode ${episode.episode} · step ${step} of ${episode.length - 1} · ${(step * player.dt).toFixed(1)} s`;
+  $('clock').textContent = `row ${row} of ${s.rows - 1} · episode ${episode.episode} · step ${step} of ${episode.length - 1} · ${(step * player.dt).toFixed(1)} s`;
   const state = s.state(row), people = s.humans(row), seen = people.filter((human) => human.visible).length;
   const parts = [`goal ${fixed(Math.hypot(state[0], state[1]), 1)} m away`, `speed ${fixed(Math.hypot(state[2], state[3]), 2)} m/s`];
   if (people.length) parts.push(`${people.length} people, ${seen} seen`);

@@ -106,7 +106,7 @@ function bindPlayer(player, keys) {
 
 function showPlayer(player) {
   const button = $('play');
-  button.textContent = player.playing ? '❚❚' : '▶';
+  button.dataset.playing = String(player.playing);
   button.setAttribute('aria-label', player.playing ? 'Pause' : 'Play');
   $('speed').value = String(player.speed);
 }

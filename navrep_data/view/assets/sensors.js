@@ -37,13 +37,17 @@ function drawPolar(ctx, w, h, scanAt) {
   ctx.lineTo(cx + 4, cy + 4);
   ctx.lineTo(cx - 4, cy + 4);
   ctx.fill();
+  let lowest = Infinity;
   for (const metres of RANGE_MARKS.filter((m) => m <= sensor.range_max)) {
-    label(ctx, metres + ' m', cx + 2, cy - size * nearness(metres) + 11);
+    const y = cy - size * nearness(metres) + 11;
+    if (lowest - y < 13) continue;
+    label(ctx, metres + ' m', cx + 2, y);
+    lowest = y;
   }
 }
 
 function angleMarks(ctx, x, w, y) {
-  for (const [angle, text, align] of ANGLE_MARKS) label(ctx, text, Math.min(Math.max(x + w * (0.5 - angle / (2 * Math.PI)), x), x + w), y, align);
+  for (const [angle, text, align] of ANGLE_MARKS.filter(([angle]) => w > 210 || Math.abs(angle) < 3)) label(ctx, text, Math.min(Math.max(x + w * (0.5 - angle / (2 * Math.PI)), x), x + w), y, align);
 }
 
 function drawStrip(ctx, w, h, scanAt) {
@@ -77,7 +81,7 @@ function rgb(colour) {
 
 // Cells in the data: angle by range, anticlockwise from ahead; on the page: left to right, near at the bottom.
 function drawRings(ctx, w, h, packed, row) {
-  const [sections, cells] = meta.rings.shape, left = 36, bottom = 15, pw = w - left - 4, ph = h - bottom - 4;
+  const [sections, cells] = meta.rings.shape, left = 42, bottom = 15, pw = w - left - 4, ph = h - bottom - 4;
   ringsImage.width = sections;
   ringsImage.height = cells;
   const picture = ringsImage.getContext('2d'), image = picture.createImageData(sections, cells);
@@ -99,7 +103,7 @@ function drawRings(ctx, w, h, packed, row) {
   ctx.strokeRect(left + 0.5, 4.5, pw - 1, ph - 1);
   for (const cell of [1, 16, 32, 48, 63]) {
     const y = 4 + ph * (1 - cell / cells);
-    label(ctx, meta.rings.edges[cell].toFixed(1) + ' m', left - 3, y + 4, 'right');
+    label(ctx, meta.rings.edges[cell].toFixed(1) + ' m', left - 3, Math.max(y + 4, 12), 'right');
   }
   angleMarks(ctx, left, pw, h - 3);
 }
