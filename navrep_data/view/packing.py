@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 NAN_CODE = 65535
 LARGEST_CODE = 65534
+HUGE = 1e30
+"""Numbers from here on mean nothing in metres and seconds: they become NaN."""
 _LEVEL = 9
 
 
@@ -25,7 +27,7 @@ def quantise(values: ArrayLike, step: float) -> tuple[NDArray[np.uint16], float,
     Parameters
     ----------
     values : array_like of float
-        Any shape; NaN and infinities become :data:`NAN_CODE`.
+        Any shape; NaN and what is not below :data:`HUGE` become :data:`NAN_CODE`.
     step : float
         Wished difference between neighbouring codes; made larger where the values' range needs it.
 
@@ -37,17 +39,12 @@ def quantise(values: ArrayLike, step: float) -> tuple[NDArray[np.uint16], float,
         What decodes them.
     """
     x = np.asarray(values, np.float64)
-    good = np.isfinite(x)
+    good = np.abs(x) < HUGE  # False for NaN
     codes = np.full(x.shape, NAN_CODE, np.uint16)
     if not good.any():
         return codes, 0.0, step
     low, high = float(x[good].min()), float(x[good].max())
-    # halves and quarters, so that the difference of two huge numbers is still finite
-    span = high / 4 - low / 4
-    step = max(step, 4 * (span / LARGEST_CODE))
-    if not np.isfinite(step):
-        codes[good] = 0
-        return codes, 0.0, 1.0
+    step = max(step, (high - low) / LARGEST_CODE)
     codes[good] = np.clip(np.rint((x[good] - low) / step), 0, LARGEST_CODE).astype(np.uint16)
     return codes, low, step
 

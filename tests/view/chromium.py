@@ -38,7 +38,8 @@ class Chromium:
         options = [
             "--headless=new", "--remote-debugging-pipe", f"--user-data-dir={profile}", "--no-first-run",
             "--disable-gpu", "--disable-dev-shm-usage", "--disable-background-networking", "--disable-sync",
-            "--disable-component-update", "--disable-extensions", "--force-color-profile=srgb", "--hide-scrollbars", "--mute-audio",
+            "--disable-component-update", "--disable-extensions",
+            "--force-color-profile=srgb", "--hide-scrollbars", "--mute-audio",
         ]  # fmt: skip
         if os.geteuid() == 0:  # containers; Chromium's sandbox refuses to run as root
             options.append("--no-sandbox")
@@ -158,7 +159,8 @@ class Tab:
         """Click (or tap) into an element, at a share of its box, through the browser's own input."""
         box = self.evaluate(
             f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
-            " e.scrollIntoView({block: 'nearest'}); const b = e.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; })()"
+            " e.scrollIntoView({block: 'nearest'}); const b = e.getBoundingClientRect();"
+            " return [b.left, b.top, b.width, b.height]; })()"
         )
         at = {"x": box[0] + x * box[2], "y": box[1] + y * box[3], "button": "left", "clickCount": 1}
         self.call("Input.dispatchMouseEvent", type="mousePressed", **at)

@@ -85,6 +85,8 @@ function drawMap(ctx, w, h) {
     const [x, y] = place(e, atEnd ? Infinity : step).map((v, axis) => (axis ? camera.y(v) : camera.x(v)));
     ctx.lineTo(x, y);
     ctx.stroke();
+    disc(ctx, camera.x(state.arrays.xy.value(0, e.at)), camera.y(state.arrays.xy.value(1, e.at)), 3);
+    ctx.stroke();
     mark(ctx, x, y, chosen ? 6 : 4, atEnd || step >= e.steps ? known(e.event) : 'moving');
     ctx.globalAlpha = 1;
   }
