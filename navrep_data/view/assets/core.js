@@ -20,6 +20,8 @@ function fatal(error) {
   $('fatal').hidden = false;
 }
 
+const DAMAGED = 'The data of this page are damaged. Make the page again with navrep-data view.';
+
 async function inflate(bytes, size) {
   if (typeof DecompressionStream === 'function') {
     let stream = null;
@@ -71,8 +73,8 @@ async function unpack(entry) {
     const text = atob($('blob-' + entry.blob).textContent.trim());
     const packed = new Uint8Array(text.length);
     for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
-    const bytes = await inflate(packed, entry.size);
-    if (bytes.length !== entry.size) throw new Error('The data of this page are damaged. Make the page again.');
+    const bytes = await inflate(packed, entry.size).catch(() => { throw new Error(DAMAGED); });
+    if (bytes.length !== entry.size) throw new Error(DAMAGED);
     const arrays = {};
     for (const [name, array] of Object.entries(entry.arrays)) arrays[name] = new Packed(array, bytes);
     unpacked.set(entry.blob, arrays);

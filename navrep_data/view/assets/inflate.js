@@ -2,7 +2,7 @@
 function inflateRaw(input, size) {
   const out = new Uint8Array(size);
   let at = 0, filled = 0, hold = 0, held = 0;
-  const fail = (why) => { throw new Error('The data of this page are damaged: ' + why + '. Make the page again.'); };
+  const fail = (why) => { throw new Error('deflate: ' + why); };
   const bits = (n) => {
     while (held < n) {
       if (at >= input.length) fail('they end early');
