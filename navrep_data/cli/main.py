@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from navrep_data._version import __version__
-from navrep_data.cli import benchmark, encode, evaluate, generate, hub, import_npz, info, models, play, train, verify
+from navrep_data.cli import benchmark, encode, evaluate, generate, hub, import_npz, info, models, play, train, verify, view
 from navrep_data.errors import NavrepDataError, did_you_mean
 
 app = typer.Typer(
@@ -29,6 +29,7 @@ app.command("play")(play.play_command)
 app.command("push")(hub.push_command)
 app.command("pull")(hub.pull_command)
 app.command("push-model")(hub.push_model_command)
+app.command("view")(view.view_command)
 app.add_typer(models.models_app, name="models")
 app.command("encode")(encode.encode_command)
 app.add_typer(train.train_app, name="train")
