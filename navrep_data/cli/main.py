@@ -9,7 +9,20 @@ from typing import Annotated, Any
 import typer
 
 from navrep_data._version import __version__
-from navrep_data.cli import benchmark, encode, evaluate, generate, hub, import_npz, info, models, play, train, verify, view
+from navrep_data.cli import (
+    benchmark,
+    encode,
+    evaluate,
+    generate,
+    hub,
+    import_npz,
+    info,
+    models,
+    play,
+    train,
+    verify,
+    view,
+)
 from navrep_data.errors import NavrepDataError, did_you_mean
 
 app = typer.Typer(
