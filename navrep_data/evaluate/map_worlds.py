@@ -20,7 +20,7 @@ F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-COARSE = 0.08
+COARSE = 0.16
 """Shortest paths are looked for on cells of at most this side [m], where the map is as fine."""
 
 
