@@ -22,6 +22,7 @@ __all__ = [
     "shards",
     "sim",
     "testing",
+    "train",
     "zoo",
 ]
 
