@@ -26,6 +26,7 @@ __all__ = [
     "shards",
     "sim",
     "testing",
+    "train",
     "zoo",
 ]
 
