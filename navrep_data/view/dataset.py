@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from navrep_data.errors import ConfigError, CorruptDataError
-from navrep_data.observations import RING_EDGES, metres_from_millimetres, scan_to_rings
+from navrep_data.observations import RING_EDGES, scan_to_rings
 from navrep_data.schema import EVENT_NAMES, RINGS_SHAPE, SCAN_SCALE
 from navrep_data.shards import DatasetFolder, EpisodeWorld, Manifest, Worlds
 from navrep_data.view.legs import leg_offsets, to_world
@@ -176,22 +176,24 @@ def _pack(rows: _Rows, manifest: Manifest) -> tuple[dict[str, Any], str, list[st
     scan = c["scan"]
     if scan.dtype == np.uint16:
         blob.add_codes("scan", scan, 0.0, SCAN_SCALE)
-        metres = metres_from_millimetres(scan)
     else:
-        metres = scan
         blob.add("scan", scan, MILLIMETRE)
     if "rings" in c:
         blob.add_bytes("rings", pack_rings(c["rings"]))
     elif manifest.sensor.covers_full_turn():
-        blob.add_bytes("rings", pack_rings(scan_to_rings(scan if scan.dtype == np.uint16 else metres)))
-    for name, step in (("robot_state", MILLIMETRE), ("action", MILLIMETRE), ("robot_pose", FINE)):
+        blob.add_bytes("rings", pack_rings(scan_to_rings(scan)))
+    for name, step in (
+        ("robot_state", MILLIMETRE),
+        ("action", MILLIMETRE),
+        ("robot_pose", MILLIMETRE),
+        ("reward", FINE),
+    ):
         if name in c and np.isfinite(c[name]).any():
-            blob.add(name, c[name].T, MILLIMETRE if name != "robot_pose" else step)
-    if "reward" in c:
-        blob.add("reward", c["reward"], FINE)
+            blob.add(name, c[name].T, step)
     episodes, starts = _episodes(rows), rows.starts()
-    worlds = _worlds_of(rows, starts)
     posed = "robot_pose" in c and bool(np.isfinite(c["robot_pose"]).all())
+    # without poses all is seen from the robot: the world's own coordinates have no place in it
+    worlds: list[EpisodeWorld | None] = _worlds_of(rows, starts) if posed else [None] * len(starts)
     if "humans" in c:
         _pack_humans(blob, rows, worlds, starts, manifest, posed)
     _pack_polygons(blob, episodes, worlds, remarks, rows.sequence)

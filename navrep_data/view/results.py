@@ -253,7 +253,6 @@ def _build(
         ],
         "notes": list(notes),
         "dt": DT,
-        "metrics": list(policies[0].metrics),
         "scenarios": scenarios or [{"name": "all", "scene": None}],
         "policies": entries,
         "maps": None,

@@ -13,6 +13,8 @@ import pytest
 from view_pages import HOSTILE, Reader
 
 from navrep_data.errors import ConfigError, DatasetNotFoundError, FolderInUseError
+from navrep_data.generate import generate
+from navrep_data.observations import scan_to_rings
 from navrep_data.schema import EVENT_NAMES
 from navrep_data.shards import DatasetFolder, Manifest
 from navrep_data.view import dataset_page
@@ -218,3 +220,23 @@ def test_view_never_imports_torch():
     code = f"import sys, navrep_data.view; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     assert done.stdout.strip() == "[]"
+
+
+def test_without_rings_people_or_worlds_the_rest_is_shown(tmp_path):
+    root = tmp_path / "bare"
+    generate(n=1, out=root, length=40, humans=3, obstacles=2, rings=False, humans_column=False)
+    whole = Reader(dataset_page(root).html)
+    (entry,) = whole.meta["sequences"]
+    arrays = whole.arrays(entry)
+    assert not {"human_x", "leg_x"} & set(arrays)
+    with DatasetFolder(root) as folder:
+        rings = scan_to_rings(folder.read("scan", 0, 0, 40))
+    cells = np.stack([(arrays["rings"] >> (2 * k)) & 3 for k in range(4)], axis=-1).reshape(rings.shape)
+    np.testing.assert_array_equal(cells, rings)
+    manifest = Manifest.read(root)
+    replace(manifest, shards=tuple(replace(s, worlds=None) for s in manifest.shards)).save(root)
+    page = Reader(dataset_page(root).html)
+    (entry,) = page.meta["sequences"]
+    assert "corners" not in entry["arrays"]
+    assert all(e["polygons"] == [] and not e["border"] for e in entry["episodes"])
+    assert "robot_pose" in entry["arrays"]

@@ -192,7 +192,7 @@ function readTables() {
     const c = policy.columns;
     let at = 0;
     policy.table = c.number.map((number, k) => {
-      const metrics = meta.metrics.map((name) => [name, c.metrics[name][k]]).filter(([, value]) => value !== null);
+      const metrics = Object.entries(c.metrics).map(([name, values]) => [name, values[k]]).filter(([, value]) => value !== null);
       const e = { number, scenario: c.scenario[k], event: c.event[k], steps: c.steps[k], seed: c.seed[k], points: c.points[k], at, metrics };
       at += e.points;
       return e;

@@ -47,7 +47,7 @@ function drawPolar(ctx, w, h, scanAt) {
 }
 
 function angleMarks(ctx, x, w, y) {
-  for (const [angle, text, align] of ANGLE_MARKS.filter(([angle]) => w > 210 || Math.abs(angle) < 3)) label(ctx, text, Math.min(Math.max(x + w * (0.5 - angle / (2 * Math.PI)), x), x + w), y, align);
+  for (const [angle, text, align] of ANGLE_MARKS.filter(([angle]) => w > 230 || Math.abs(angle) < (w > 140 ? 3 : 1))) label(ctx, text, Math.min(Math.max(x + w * (0.5 - angle / (2 * Math.PI)), x), x + w), y, align);
 }
 
 function drawStrip(ctx, w, h, scanAt) {
