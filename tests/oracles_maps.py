@@ -134,6 +134,41 @@ def arrival_times(speeds, goal):
     return out
 
 
+def original_times(speeds, goal):
+    """Return arrival times as the released software finds them: from any times so far, float32, latest cell first."""
+    times = {goal: np.float32(0)}
+    done = {tuple(cell) for cell in np.argwhere(~(speeds > 0)).tolist()}
+    heap = [(np.float32(0), -goal[0], -goal[1])]
+    never = np.float32(np.inf)
+    first = True
+    while heap:
+        _, i, j = heapq.heappop(heap)
+        cell = (-i, -j)
+        if cell in done and not first:
+            continue
+        first = False
+        done.add(cell)
+        for step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+            i, j = cell[0] + step[0], cell[1] + step[1]
+            if not (0 <= i < speeds.shape[0] and 0 <= j < speeds.shape[1]) or (i, j) in done:
+                continue
+            a = min(times.get((i - 1, j), never), times.get((i + 1, j), never))
+            b = min(times.get((i, j - 1), never), times.get((i, j + 1), never))
+            speed = np.float32(speeds[i, j])
+            inner = np.float32(2) * np.float32(1.0 / float(speed * speed)) - (a - b) * (a - b)
+            if inner > 0:
+                value = np.float32((float(a + b) + math.sqrt(inner)) / 2)
+            else:
+                value = np.float32(1.0 / float(speed) + float(min(a, b)))
+            if value < times.get((i, j), never):
+                times[i, j] = value
+                heapq.heappush(heap, (value, -i, -j))
+    out = np.full(speeds.shape, never, np.float32)
+    for cell, value in times.items():
+        out[cell] = value
+    return out
+
+
 def original_path(field, start, random_state=None):
     """Walk down a field by the released software's rules; ties by `random_state` (numpy's legacy generator) or first.
 
@@ -141,7 +176,12 @@ def original_path(field, start, random_state=None):
     for the rest of the path and forbids the diagonals beside it, except up-right.
     """
     straight = {"up": (0, 1), "right": (1, 0), "down": (0, -1), "left": (-1, 0)}
-    diagonal = {("up", "right"): (1, 1), ("down", "right"): (1, -1), ("up", "left"): (-1, 1), ("down", "left"): (-1, -1)}
+    diagonal = {
+        ("up", "right"): (1, 1),
+        ("down", "right"): (1, -1),
+        ("up", "left"): (-1, 1),
+        ("down", "left"): (-1, -1),
+    }
     path, shut = [start], set()
     while True:
         i, j = path[-1]

@@ -56,6 +56,10 @@ def generate_command(
         ),
     ] = None,
     legs: Annotated[bool, typer.Option("--legs/--trunk", help="What the lidar sees of a human.")] = True,
+    maps: Annotated[
+        list[str] | None,
+        typer.Option("--map", help="Map of --env map: a name, a YAML file or its folder; may be repeated."),
+    ] = None,
     policy: Annotated[
         str,
         typer.Option(
@@ -88,9 +92,9 @@ def generate_command(
 
     result = generate(
         env=env, n=n, out=out, seed=seed, workers=_cores() if workers is None else workers, length=length,
-        physics=physics, humans=humans, obstacles=obstacles, legs=legs, policy=policy, policy_batch=policy_batch,
-        shard_size=shard_size, scan_dtype=scan_dtype, rings=rings, humans_column=humans_column,
-        progress=show_progress(), report=say_err if as_json else say,
+        physics=physics, humans=humans, obstacles=obstacles, legs=legs, maps=maps or None, policy=policy,
+        policy_batch=policy_batch, shard_size=shard_size, scan_dtype=scan_dtype, rings=rings,
+        humans_column=humans_column, progress=show_progress(), report=say_err if as_json else say,
     )  # fmt: skip
     if as_json:
         print_json(result.to_dict())

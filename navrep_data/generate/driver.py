@@ -8,7 +8,7 @@ import shlex
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,7 @@ def generate(
     humans: int | None = None,
     obstacles: int | None = None,
     legs: bool = True,
+    maps: Sequence[str] | None = None,
     policy: str | PolicyFunction = "orca",
     policy_batch: int = 64,
     shard_size: int | None = None,
@@ -129,6 +130,8 @@ def generate(
         ``"consistent"`` by default.
     humans : int, optional
         Mean number of humans.
+    maps : sequence of str, optional
+        Names or paths of the maps, for ``env="map"``.
     obstacles : int, optional
         Largest number of squares, and of walls.
     legs : bool
@@ -171,8 +174,8 @@ def generate(
     say = report or (lambda _: None)
     started = time.perf_counter()
     config = make_config(
-        env, physics=physics, humans=humans, obstacles=obstacles, rendering="legs" if legs else "trunk",
-        curriculum="constant",
+        env, physics=physics, humans=humans, obstacles=obstacles, rendering=None if legs else "trunk",
+        curriculum="constant", maps=None if maps is None else tuple(maps),
     )  # fmt: skip
     check_seed(seed)
     check_count("workers", workers, 1, MAX_WORKERS)
@@ -182,7 +185,9 @@ def generate(
     root = Path(out) if out is not None else Path("data") / env
     settings = check_settings(config, length, scan_dtype, rings, humans_column)
     request = make_request(root, config, settings, chosen, seed, n, shard_size, "")
-    request = replace(request, command=_command(request, env, physics, humans, obstacles, legs, shard_size, scan_dtype))
+    request = replace(
+        request, command=_command(request, env, physics, humans, obstacles, legs, maps, shard_size, scan_dtype)
+    )
     existed = root.exists()
     try:
         check_folder(root)
@@ -211,7 +216,7 @@ def generate(
 
 def _command(
     request: Request, env: str, physics: str | None, humans: int | None, obstacles: int | None, legs: bool,
-    shard_size: int | None, scan_dtype: str | None,
+    maps: Sequence[str] | None, shard_size: int | None, scan_dtype: str | None,
 ) -> str:  # fmt: skip
     """Return the command line that makes the same dataset: for the card."""
     spec = request.spec
@@ -222,6 +227,7 @@ def _command(
         if value is not None:
             words += [flag, str(value)]
     words += [] if legs else ["--trunk"]
+    words += [word for name in maps or () for word in ("--map", name)]
     if spec.policy.name != "orca":
         words += ["--policy", spec.policy.name]
     if not spec.policy.scripted and spec.policy.batch != 64:

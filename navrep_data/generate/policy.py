@@ -11,9 +11,11 @@ from typing import Any
 from navrep_data.errors import PolicyError
 from navrep_data.sim import (
     SCRIPTED,
+    CallableMapRollout,
     CallableRollout,
     PolicyFunction,
     RolloutSettings,
+    ScriptedMapRollout,
     ScriptedPolicy,
     ScriptedRollout,
     SimConfig,
@@ -102,7 +104,10 @@ def make_rollout(
     config: SimConfig, settings: RolloutSettings, policy: PolicySpec, seed: int
 ) -> ScriptedRollout | CallableRollout:
     """Return the object that makes this dataset's sequences."""
+    on_map = config.world == "map"
     if policy.scripted:
-        return ScriptedRollout(config, settings, ScriptedPolicy(policy.name), seed)
+        scripted = ScriptedMapRollout if on_map else ScriptedRollout
+        return scripted(config, settings, ScriptedPolicy(policy.name), seed)
     function = policy.function if policy.function is not None else load_callable(policy.name)
-    return CallableRollout(config, settings, function, seed, policy.batch)
+    called = CallableMapRollout if on_map else CallableRollout
+    return called(config, settings, function, seed, policy.batch)

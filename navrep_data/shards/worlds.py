@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import struct
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,14 @@ _FIELDS: dict[str, tuple[str, tuple[int, ...], str]] = {
 }
 WORLD_FIELDS = tuple(_FIELDS)
 """Names of the arrays of a worlds file, in file order."""
+# In place of polygons, datasets on maps say which map: its name, the hash of its content, and the scenario or ''.
+_MAP_FIELDS: dict[str, tuple[str, tuple[int, ...], str]] = {
+    "map": ("|S64", (), "episode"),
+    "map_hash": ("|S64", (), "episode"),
+    "scenario": ("|S64", (), "episode"),
+}
+MAP_WORLD_FIELDS = tuple(_MAP_FIELDS)
+"""Names of the arrays that the worlds files of datasets on maps have besides, in file order."""
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -77,6 +85,8 @@ class EpisodeWorld:
         Whether the human avoids the robot.
     human_gait : ndarray of shape (H, 3), float32
         Gait distances accumulated at the episode's first row [m, m, rad].
+    map, map_hash, scenario : str
+        On maps: the map's name, its content's hash (``GridMap.hash``) and the scenario's name; '' elsewhere.
     """
 
     sequence: int
@@ -92,6 +102,9 @@ class EpisodeWorld:
     human_v_pref: npt.NDArray[np.float32]
     human_sees_robot: npt.NDArray[np.bool_]
     human_gait: npt.NDArray[np.float32]
+    map: str = ""
+    map_hash: str = ""
+    scenario: str = ""
 
 
 @dataclass(frozen=True)
@@ -139,7 +152,13 @@ class Worlds:
             human_v_pref=a["human_v_pref"][h],
             human_sees_robot=a["human_sees_robot"][h],
             human_gait=a["human_gait"][h],
+            **{name: a[name][index].decode("ascii", "replace") for name in MAP_WORLD_FIELDS if name in a},
         )
+
+
+def _fields_of(names: Collection[str]) -> dict[str, tuple[str, tuple[int, ...], str]]:
+    """Return the fields that a worlds file with these arrays should have."""
+    return _FIELDS | _MAP_FIELDS if any(name in names for name in _MAP_FIELDS) else _FIELDS
 
 
 def check_worlds(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
@@ -150,10 +169,11 @@ def check_worlds(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
     arrays : mapping of str to ndarray
         As in :data:`WORLD_FIELDS`.
     """
-    if set(arrays) != set(_FIELDS):
-        odd = sorted(set(arrays) ^ set(_FIELDS))[0]
+    fields = _fields_of(arrays)
+    if set(arrays) != set(fields):
+        odd = sorted(set(arrays) ^ set(fields))[0]
         return f"array {odd!r} is {'unexpected' if odd in arrays else 'missing'}"
-    for name, (dtype, tail, _) in _FIELDS.items():
+    for name, (dtype, tail, _) in fields.items():
         array = arrays[name]
         if array.dtype != np.dtype(dtype) or array.ndim != 1 + len(tail) or array.shape[1:] != tail:
             wanted = f"{np.dtype(dtype)} ({', '.join(['n', *map(str, tail)])})"
@@ -165,7 +185,7 @@ def check_worlds(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
     }
     sizes["episode+1"] = sizes["episode"] + 1
     sizes["polygon+1"] = len(arrays["polygon_offset"])
-    for name, (_, _, axis) in _FIELDS.items():
+    for name, (_, _, axis) in fields.items():
         if len(arrays[name]) != sizes[axis]:
             return f"array {name!r} has {len(arrays[name])} entries, expected {sizes[axis]}"
     ends = {"polygon_offset": "vertex", "human_offset": "human", "episode_polygon_offset": "polygon+1"}
@@ -187,7 +207,8 @@ def as_worlds(arrays: Mapping[str, npt.ArrayLike]) -> Arrays:
     CorruptDataError
         If an array is missing or has another shape.
     """
-    cast = {k: np.asarray(v, dtype=_FIELDS[k][0] if k in _FIELDS else None) for k, v in arrays.items()}
+    fields = _fields_of(arrays)
+    cast = {k: np.asarray(v, dtype=fields[k][0] if k in fields else None) for k, v in arrays.items()}
     problem = check_worlds(cast)
     if problem:
         raise CorruptDataError(f"Worlds of a sequence: {problem}; fix the caller of ShardWriter.append.")
@@ -197,7 +218,8 @@ def as_worlds(arrays: Mapping[str, npt.ArrayLike]) -> Arrays:
 def concatenate_worlds(parts: Sequence[Arrays]) -> Arrays:
     """Join the worlds of consecutive sequences; offsets, each starting at 0, are moved up."""
     result: Arrays = {}
-    for name, (dtype, tail, axis) in _FIELDS.items():
+    fields = _fields_of([name for part in parts for name in part])
+    for name, (dtype, tail, axis) in fields.items():
         if axis.endswith("+1"):
             pieces, base = [np.zeros(1, dtype)], 0
             for part in parts:
@@ -233,7 +255,7 @@ def _zip_bytes(members: Mapping[str, bytes]) -> bytes:
 def worlds_bytes(arrays: Arrays) -> bytes:
     """Return a worlds file: equal arrays give equal bytes."""
     members = {}
-    for name in _FIELDS:
+    for name in _fields_of(arrays):
         buffer = io.BytesIO()
         np.lib.format.write_array(buffer, np.ascontiguousarray(arrays[name]), version=(1, 0), allow_pickle=False)
         members[f"{name}.npy"] = buffer.getvalue()
@@ -246,8 +268,9 @@ def _member(archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
     if np.lib.format.read_magic(stream) != (1, 0):
         raise ValueError(f"array {name!r} is not npy version 1.0")
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    if dtype != np.dtype(_FIELDS[name][0]) or (fortran and len(shape) > 1):
-        raise ValueError(f"array {name!r} is {dtype}, expected {_FIELDS[name][0]} in C order")
+    wanted = (_FIELDS | _MAP_FIELDS)[name][0]
+    if dtype != np.dtype(wanted) or (fortran and len(shape) > 1):
+        raise ValueError(f"array {name!r} is {dtype}, expected {wanted} in C order")
     data = stream.read()
     count = 1
     for n in shape:
@@ -268,12 +291,13 @@ def parse_worlds(data: bytes, where: str) -> Worlds:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             names = [entry.filename for entry in archive.infolist()]
-            if sorted(names) != sorted(f"{name}.npy" for name in _FIELDS):
+            fields = _fields_of([name.removesuffix(".npy") for name in names])
+            if sorted(names) != sorted(f"{name}.npy" for name in fields):
                 raise ValueError(f"its members are {names[:20]}")
             # zipfile stops at the size that the directory declares, so this bounds what is unpacked.
             if sum(entry.file_size for entry in archive.infolist()) > MAX_WORLDS_BYTES:
                 raise ValueError(f"it unpacks to more than {MAX_WORLDS_BYTES:,} bytes")
-            arrays = {name: _member(archive, name) for name in _FIELDS}
+            arrays = {name: _member(archive, name) for name in fields}
         problem = check_worlds(arrays)
         if problem:
             raise ValueError(problem)

@@ -2,6 +2,9 @@
 
 from navrep_data.sim.actions import scale_actions
 from navrep_data.sim.config import SimConfig
+from navrep_data.sim.gridmap import GridMap
+from navrep_data.sim.map_rollout import CallableMapRollout, ScriptedMapRollout
+from navrep_data.sim.maps import load_map, map_names
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
 from navrep_data.sim.registry import describe_environment, environment_names, gymnasium_id, make_config, numpy_seed
 from navrep_data.sim.rollout import (
@@ -11,13 +14,19 @@ from navrep_data.sim.rollout import (
     ScriptedRollout,
     SequenceRows,
 )
+from navrep_data.sim.scenarios import MAP_GROUPS, Scenario, get_scenario, scenario_names
 from navrep_data.sim.simulator import Simulator, WorldState, check_seed, warm_up
 
 __all__ = [
+    "MAP_GROUPS",
     "SCRIPTED",
+    "CallableMapRollout",
     "CallableRollout",
+    "GridMap",
     "PolicyFunction",
     "RolloutSettings",
+    "Scenario",
+    "ScriptedMapRollout",
     "ScriptedPolicy",
     "ScriptedRollout",
     "SequenceRows",
@@ -27,9 +36,13 @@ __all__ = [
     "check_seed",
     "describe_environment",
     "environment_names",
+    "get_scenario",
     "gymnasium_id",
+    "load_map",
     "make_config",
+    "map_names",
     "numpy_seed",
     "scale_actions",
+    "scenario_names",
     "warm_up",
 ]

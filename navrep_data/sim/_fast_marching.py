@@ -14,6 +14,9 @@ from navrep_data.sim._rng import integer
 
 # Ties between equally steep directions: the first one, or one drawn from a random stream.
 TIE_FIRST, TIE_RANDOM = 0, 1
+# Which neighbours count for the time of a cell: those whose own time is final, which is fast marching; or, as in the
+# original, also those that may still get an earlier one, which gives times up to some per cent too short beside walls.
+UPWIND_FINAL, UPWIND_ORIGINAL = 0, 1
 # Which diagonal steps are allowed: those that cut no closed corner, or the original's rule.
 CORNERS_CLOSED, CORNERS_ORIGINAL = 0, 1
 
@@ -67,15 +70,18 @@ def _pop(heap, size):
 
 
 @kernel
-def _arrival(field, speeds, i, j):
+def _time_of(field, done, i, j, upwind):
+    """Return the time of a neighbour, inf where there is none that counts."""
+    if i < 0 or i >= field.shape[0] or j < 0 or j >= field.shape[1] or (upwind == UPWIND_FINAL and not done[i, j]):
+        return _INF
+    return field[i, j]
+
+
+@kernel
+def _arrival(field, done, speeds, i, j, upwind):
     """Return the first-order upwind solution at a cell from its four neighbours, float32."""
-    width, height = field.shape
-    a = field[i - 1, j] if i > 0 else _INF
-    if i < width - 1:
-        a = min(a, field[i + 1, j])
-    b = field[i, j - 1] if j > 0 else _INF
-    if j < height - 1:
-        b = min(b, field[i, j + 1])
+    a = min(_time_of(field, done, i - 1, j, upwind), _time_of(field, done, i + 1, j, upwind))
+    b = min(_time_of(field, done, i, j - 1, upwind), _time_of(field, done, i, j + 1, upwind))
     s = speeds[i, j]
     gap = a - b
     inner = _TWO * np.float32(1.0 / np.float64(s * s)) - gap * gap
@@ -85,11 +91,12 @@ def _arrival(field, speeds, i, j):
 
 
 @kernel
-def march(speeds, goal_i, goal_j, field):
+def march(speeds, goal_i, goal_j, upwind, field):
     """Solve the eikonal equation from one cell outwards by fast marching, with four neighbours.
 
     speeds          (W, H) float32 speed in each cell [cells per unit of time]; 0 or less = closed
     goal_i, goal_j  cell where the time is 0; may itself be closed
+    upwind          UPWIND_FINAL or UPWIND_ORIGINAL
     field           (W, H) float32 out: time to the goal, inf in closed cells and in those that do not reach it
     """
     width, height = speeds.shape
@@ -97,6 +104,7 @@ def march(speeds, goal_i, goal_j, field):
     closed = np.zeros((width, height), np.bool_)
     for i in range(width):
         for j in range(height):
+            # closed for good: solid, or its time is final
             closed[i, j] = not speeds[i, j] > _ZERO
     field[goal_i, goal_j] = _ZERO
     heap = np.empty(4 * (width + height) + 64, np.uint64)
@@ -119,7 +127,7 @@ def march(speeds, goal_i, goal_j, field):
             ni, nj = i + _DI[n], j + _DJ[n]
             if ni < 0 or ni >= width or nj < 0 or nj >= height or closed[ni, nj]:
                 continue
-            value = _arrival(field, speeds, ni, nj)
+            value = _arrival(field, closed, speeds, ni, nj, upwind)
             if value < field[ni, nj]:
                 field[ni, nj] = value
                 _push(heap, size, _key(value, ni * height + nj))

@@ -44,12 +44,14 @@ LARGEST_SQUARE = 255
 QUIRK_NONE, QUIRK_SINGLE, QUIRK_MANY = 0, 1, 2
 _TURN = 2.0 * math.pi
 # Rays that go forward together: enough that vectors are full and memory has several requests at a time.
-LANES = 16
+LANES = 8
 # Rows of the lanes' state: sensor, direction and its inverse, time of the last leap [cells]; then whole numbers.
 _PX, _PY, _C, _S, _INVERSE_C, _INVERSE_S, _T = 0, 1, 2, 3, 4, 5, 6
 _LANE_FLOATS = 7
 _PLANE, _I, _J, _SIDE = 0, 1, 2, 3
 _LANE_INTS = 4
+# In place of 1 / 0: infinity times a distance of 0 would be no number.
+_NEVER = 1e300
 _NONE, _ONE = np.int32(0), np.int32(1)
 
 
@@ -79,9 +81,9 @@ def free_squares(occupied, squares):
 
 @kernel
 def _start_ray(x, y, c, s, width, height):
-    """Return where a ray starts on the map: entry cell i, j, side of it (0 = misses the map).
+    """Return when a ray is first on the map, and in which cell; column `width` where it misses the map.
 
-    All in cells, mirrored so that the direction (c, s) has no negative part; i = width where it misses.
+    All in cells, mirrored so that the direction (c, s) has no negative part.
     """
     t = 0.0
     if x < 0.0:
@@ -90,11 +92,11 @@ def _start_ray(x, y, c, s, width, height):
         t = max(t, -y / s if s > 0.0 else np.inf)
     if t > 0.0:
         if t == np.inf:
-            return width, 0
+            return 0.0, width, 0
         x, y = max(x + t * c, 0.0), max(y + t * s, 0.0)
     if x >= width or y >= height:
-        return width, 0
-    return np.int64(x), np.int64(y)
+        return 0.0, width, 0
+    return t, np.int64(x), np.int64(y)
 
 
 @kernel
@@ -111,13 +113,13 @@ def _step_lanes(lanes_f, lanes_i):
         tx = (i + side - px[b]) * inverse_c[b]
         ty = (j + side - py[b]) * inverse_s[b]
         across = tx <= ty
-        t = tx if across else ty
+        moves = side > _NONE
+        t = (tx if across else ty) if moves else 0.0
         # into a cell that shares a side with the square, whatever rounding says
         ni = min(max(np.int32(px[b] + t * c[b]), i), i + side - _ONE)
         nj = min(max(np.int32(py[b] + t * s[b]), j), j + side - _ONE)
         ni = i + side if across else ni
         nj = nj if across else j + side
-        moves = side > _NONE
         column[b] = ni if moves else i
         row[b] = nj if moves else j
         time[b] = t if moves else time[b]
@@ -160,13 +162,11 @@ def grid_inverse_ranges(squares, x0, y0, resolution, x, y, theta, directions, in
             plane = (1 if c < 0.0 else 0) + (2 if s < 0.0 else 0)
             c, s = abs(c), abs(s)
             lanes_f[_PX, b], lanes_f[_PY, b], lanes_f[_C, b], lanes_f[_S, b] = px, py, c, s
-            lanes_f[_INVERSE_C, b] = 1.0 / c if c > 0.0 else np.inf
-            lanes_f[_INVERSE_S, b] = 1.0 / s if s > 0.0 else np.inf
-            i, j = _start_ray(px, py, c, s, width, height)
-            lanes_i[_PLANE, b], lanes_i[_I, b], lanes_i[_J, b] = plane, i, j
-            # a sensor outside that looks at a solid cell on the edge of the map
-            t = max(-px / c if px < 0.0 and c > 0.0 else 0.0, -py / s if py < 0.0 and s > 0.0 else 0.0)
+            lanes_f[_INVERSE_C, b] = 1.0 / c if c > 0.0 else _NEVER
+            lanes_f[_INVERSE_S, b] = 1.0 / s if s > 0.0 else _NEVER
+            t, i, j = _start_ray(px, py, c, s, width, height)
             lanes_f[_T, b] = t
+            lanes_i[_PLANE, b], lanes_i[_I, b], lanes_i[_J, b] = plane, i, j
         while _load_lanes(squares, lanes_i):
             _step_lanes(lanes_f, lanes_i)
         for b in range(count):

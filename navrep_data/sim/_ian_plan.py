@@ -9,15 +9,15 @@ import numpy as np
 from navrep_data._kernels import kernel
 from navrep_data.sim._fast_marching import CORNERS_CLOSED, CORNERS_ORIGINAL, TIE_RANDOM, descend
 from navrep_data.sim._ian_layout import (
-    TASK_LOITER,
-    TASK_NONE,
-    TASK_WALK,
     T_PLAN_HEIGHT,
     T_PLAN_RESOLUTION,
     T_PLAN_WIDTH,
     T_WAYPOINT,
     T_X0,
     T_Y0,
+    TASK_LOITER,
+    TASK_NONE,
+    TASK_WALK,
     W_CMD_OMEGA,
     W_CMD_X,
     W_CMD_Y,

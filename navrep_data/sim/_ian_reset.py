@@ -7,7 +7,7 @@ Source: ianenv.py, markenv.py, jointenv.py of NavRep, pepper_2d_simulator.py (SI
 import numpy as np
 
 from navrep_data._kernels import kernel
-from navrep_data.sim._fast_marching import march
+from navrep_data.sim._fast_marching import UPWIND_ORIGINAL, march
 from navrep_data.sim._ian_layout import (
     C_CAST,
     C_HUMANS,
@@ -125,7 +125,7 @@ def _clear_of(agents, n, x, y, gap):
 
 @kernel
 def _nth_spot(agents, n, maps, map_row, gap, x, y, least, rng):
-    """Draw a spot off agents 0 .. n - 1 by `gap` and farther than `least` from (x, y); returns its row, -1: there is none.
+    """Draw a spot off agents 0 .. n - 1 by `gap`, farther than `least` from (x, y); returns its row, -1: there is none.
 
     The original's way: one draw among those that are left.
     """
@@ -203,7 +203,7 @@ def _keep_field(agents, walkers, place, own_field, maps, map_row):
     speeds = maps.pace[start : start + size].reshape(width, height)
     i = cell_index(agents[0, A_GX], map_row[T_X0], map_row[T_PLAN_RESOLUTION], width)
     j = cell_index(agents[0, A_GY], map_row[T_Y0], map_row[T_PLAN_RESOLUTION], height)
-    march(speeds, i, j, own_field[:size].reshape(width, height))
+    march(speeds, i, j, UPWIND_ORIGINAL, own_field[:size].reshape(width, height))
     place[M_HAS_FIELD] = 1.0
 
 

@@ -182,10 +182,7 @@ def _collide(agents, walkers, contacts, circles, n, maps, map_row, rules):
             walkers[j, W_DAMAGE] += np.hypot(agents[j, A_VX], agents[j, A_VY])
             walkers[i, W_HIT] = COLLISION_HUMAN
             walkers[j, W_HIT] = COLLISION_HUMAN
-            if rules[R_BOUNCE]:
-                put_back(agents, walkers, i)
-                put_back(agents, walkers, j)
-            elif i >= robots:  # humans bump into each other and go on
+            if rules[R_BOUNCE] or i >= robots:  # humans bump into each other and go on
                 put_back(agents, walkers, i)
                 put_back(agents, walkers, j)
             break

@@ -61,11 +61,18 @@ def measure(r, agents, n_agents, scalars, edges, polygon_start, moves, dt):
     `moves` (N, 3) holds everybody's velocity during the step [m/s].
     """
     best = np.inf
-    for j in range(n_agents):
-        if j != r:
-            gap = agent_gap(r, j, agents, moves, dt)
-            if gap < best:
-                best = gap
+    x, y, radius = agents[r, A_X], agents[r, A_Y], agents[r, A_RADIUS]
+    vx, vy = moves[r, 0], moves[r, 1]
+    for j in range(n_agents):  # `agent_gap`, written out for speed
+        if j == r:
+            continue
+        rx = agents[j, A_X] - x
+        ry = agents[j, A_Y] - y
+        ex = rx + (moves[j, 0] - vx) * dt
+        ey = ry + (moves[j, 1] - vy) * dt
+        gap = np.sqrt(point_segment_sq(0.0, 0.0, rx, ry, ex, ey)) - agents[j, A_RADIUS] - radius
+        if gap < best:
+            best = gap
     agents[r, A_CLEAR_HUMAN] = best
     x0, y0 = agents[r, A_X], agents[r, A_Y]
     x1, y1 = x0 + moves[r, 0] * dt, y0 + moves[r, 1] * dt

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import zipfile
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +20,7 @@ from navrep_data.io import atomic_write_bytes, cache_dir
 
 # Raised with any change of what the files mean; old ones are then left alone.
 FORMAT = 1
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 _DAMAGED = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError)
 
 
@@ -35,9 +38,9 @@ def content_hash(*parts: object) -> str:
 
 
 def cached_on_disk(
-    kind: str, key: str, shape: tuple[int, ...], make: Callable[[], NDArray[np.float32]]
-) -> NDArray[np.float32]:
-    """Return the float32 array stored under `key`, made and stored where it is missing or damaged.
+    kind: str, key: str, shape: tuple[int, ...], make: Callable[[], NDArray[_Scalar]], dtype: type[_Scalar]
+) -> NDArray[_Scalar]:
+    """Return the array stored under `key`, made and stored where it is missing or damaged.
 
     A cache that cannot be written costs time and is not an error.
 
@@ -51,9 +54,11 @@ def cached_on_disk(
         Expected shape.
     make : callable
         Works the array out.
+    dtype : type
+        Type of its elements.
     """
     path = cache_dir() / "maps" / f"{kind}-v{FORMAT}-{key}.npz"
-    stored = _read(path, shape)
+    stored = _read(path, shape, dtype)
     if stored is not None:
         return stored
     array = make()
@@ -67,16 +72,16 @@ def cached_on_disk(
     return array
 
 
-def _read(path: Path, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
+def _read(path: Path, shape: tuple[int, ...], dtype: type[_Scalar]) -> NDArray[_Scalar] | None:
     """Return what `path` holds, None where it is not exactly what was stored (the archive carries a checksum)."""
     try:
-        if path.stat().st_size > 4 * int(np.prod(shape)) + 4096:
+        if path.stat().st_size > np.dtype(dtype).itemsize * math.prod(shape) + 4096:
             return None
-        with np.load(path, allow_pickle=False) as data:
-            array: NDArray[np.float32] = data["values"]
+        with open(path, "rb") as handle, np.load(handle, allow_pickle=False) as data:
+            array: NDArray[_Scalar] = data["values"]
     except _DAMAGED:
         return None
-    return array if array.shape == shape and array.dtype == np.float32 else None
+    return array if array.shape == shape and array.dtype == dtype else None
 
 
 class RecentArrays:

@@ -222,9 +222,13 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
                 if image.mode not in _GREY_MODES:
                     raise MapError(f"{path} has pixels of mode {image.mode}, expected 8-bit grey: convert it to that.")
                 return np.array(image.convert("L"), dtype=np.uint8)
-    except (OSError, ValueError, SyntaxError, EOFError, MemoryError, Image.DecompressionBombError) as error:
-        if isinstance(error, MapError):
-            raise
+    except MapError:
+        raise
+    except Image.DecompressionBombError as error:
+        raise MapError(
+            f"{path} has far more pixels than expected, at most {MAX_PIXELS:,}: crop it or halve its resolution."
+        ) from error
+    except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
         said = " ".join(str(error).split())[:120]
         raise MapError(f"{path} cannot be read as an image ({said}): expected a PGM or PNG of 8-bit grey.") from error
 

@@ -32,27 +32,6 @@ from navrep_data.sim._layout import (
     S_POLYGONS,
 )
 
-TWO_PI = 2.0 * np.pi
-
-
-@kernel
-def propose(r, agents, flags, commands, moves):
-    """Write to moves[r] how robot r moves in this step: velocity in the world frame [m/s] and rotation [rad/s].
-
-    `commands` holds three numbers per robot, in its own frame. With inertia the robot goes on as it was: the command
-    acts on its acceleration afterwards.
-    """
-    if flags[F_INERTIA]:
-        moves[r, 0], moves[r, 1], moves[r, 2] = agents[r, A_VX], agents[r, A_VY], agents[r, A_OMEGA]
-        return
-    ax, ay = commands[3 * r], commands[3 * r + 1]
-    if flags[F_DIFFERENTIAL]:
-        ay = 0.0
-    c, s = np.cos(agents[r, A_HEADING]), np.sin(agents[r, A_HEADING])
-    moves[r, 0] = c * ax - s * ay
-    moves[r, 1] = s * ax + c * ay
-    moves[r, 2] = commands[3 * r + 2]
-
 
 @kernel
 def _limited(acceleration, wanted, most, jerk, dt):
@@ -91,17 +70,10 @@ def _accelerate(r, agents, params, flags, commands, moves):
 
 
 @kernel
-def move_robot(r, agents, params, flags, commands, moves):
-    """Move robot r: it translates along its old heading and turns afterwards, as the original does."""
+def go_on(r, before, agents, params, flags, commands, moves):
+    """Do the rest of robot r's motion: its legs, where others see them, and its inertia; `before`: its old heading."""
     dt = params[P_DT]
-    before = agents[r, A_HEADING]
-    agents[r, A_X] += moves[r, 0] * dt
-    agents[r, A_Y] += moves[r, 1] * dt
-    agents[r, A_VX] = moves[r, 0]
-    agents[r, A_VY] = moves[r, 1]
-    agents[r, A_HEADING] = (before + moves[r, 2] * dt) % TWO_PI
-    agents[r, A_OMEGA] = moves[r, 2]
-    if flags[F_ROBOTS] > 1:  # other robots see its legs
+    if flags[F_ROBOTS] > 1:
         c, s = np.cos(before), np.sin(before)
         agents[r, A_GAIT_X] += (c * moves[r, 0] + s * moves[r, 1]) * dt
         agents[r, A_GAIT_Y] += (c * moves[r, 1] - s * moves[r, 0]) * dt

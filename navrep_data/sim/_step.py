@@ -26,10 +26,12 @@ from navrep_data.sim._layout import (
     A_Y,
     F_ADAPTIVE,
     F_DAMAGE,
+    F_DIFFERENTIAL,
     F_ELLIPSE,
     F_GAP_QUIRK,
     F_HIDE_OMEGA,
     F_HUMAN_POLICY,
+    F_INERTIA,
     F_LEGS,
     F_NOISE,
     F_ORIGINAL,
@@ -66,7 +68,7 @@ from navrep_data.sim._obstacles import build_obstacles
 from navrep_data.sim._orca import orca_velocity
 from navrep_data.sim._original import draw_original, judge_original, walk_original
 from navrep_data.sim._rng import is_mersenne
-from navrep_data.sim._robots import first_event, move_robot, propose, put_back
+from navrep_data.sim._robots import first_event, go_on, put_back
 from navrep_data.sim._worlds import add_border, draw_world
 
 # orca.py of the original: agents enter RVO2 with their radius plus 1 cm
@@ -287,8 +289,14 @@ def step_world(
     robots = flags[F_ROBOTS]
     stop = robots + int(scalars[S_HUMANS])
     choose_humans(agents, agents32, scalars, obst_f, obst_i, flags, orca_params, work_f, work_i, moves)
+    # Two loops are written out here that could be functions: arguments cost as much as what they do.
     for r in range(robots):
-        propose(r, agents, flags, commands, moves)
+        if flags[F_INERTIA]:  # it goes on as it was; the command acts on its acceleration afterwards
+            moves[r, 0], moves[r, 1], moves[r, 2] = agents[r, A_VX], agents[r, A_VY], agents[r, A_OMEGA]
+        else:
+            ax, ay = commands[3 * r], 0.0 if flags[F_DIFFERENTIAL] else commands[3 * r + 1]
+            c, s = np.cos(agents[r, A_HEADING]), np.sin(agents[r, A_HEADING])
+            moves[r, 0], moves[r, 1], moves[r, 2] = c * ax - s * ay, s * ax + c * ay, commands[3 * r + 2]
     original = flags[F_ORIGINAL] != 0
     event = NONE
     if original:
@@ -313,7 +321,13 @@ def step_world(
                 scalars[S_CLEAR_STATIC] = min(scalars[S_CLEAR_STATIC], agents[r, A_CLEAR_STATIC])
         result[robots] = event
     for r in range(robots):
-        move_robot(r, agents, params, flags, commands, moves)
+        before = agents[r, A_HEADING]
+        agents[r, A_X] += moves[r, 0] * dt
+        agents[r, A_Y] += moves[r, 1] * dt
+        agents[r, A_VX], agents[r, A_VY], agents[r, A_OMEGA] = moves[r, 0], moves[r, 1], moves[r, 2]
+        agents[r, A_HEADING] = (before + moves[r, 2] * dt) % TWO_PI
+        if robots > 1 or flags[F_INERTIA]:
+            go_on(r, before, agents, params, flags, commands, moves)
     if original:
         walk_original(agents, int(scalars[S_HUMANS]), moves, dt)
     else:
@@ -325,40 +339,36 @@ def step_world(
 
 
 @kernel
-def fill_bodies(i, agents, owner, flags, rows):
-    """Write agent i as the lidar sees it to the first of `rows` (two legs, a trunk or an ellipse); returns how many."""
-    if flags[F_LEGS]:
-        speed = np.hypot(agents[i, A_VX], agents[i, A_VY])
-        leg_circles(
-            agents[i, A_X], agents[i, A_Y], agents[i, A_HEADING], speed,
-            agents[i, A_GAIT_X], agents[i, A_GAIT_Y], agents[i, A_GAIT_T], owner, rows[:2],
-        )  # fmt: skip
-        return 2
-    if flags[F_ELLIPSE]:
-        body_ellipse(agents[i, A_X], agents[i, A_Y], agents[i, A_HEADING], agents[i, A_RADIUS], owner, rows[0])
-    else:
-        rows[0, 0] = agents[i, A_X]
-        rows[0, 1] = agents[i, A_Y]
-        rows[0, 2] = agents[i, A_RADIUS]
-        rows[0, 3] = owner
-    return 1
-
-
-@kernel
 def fill_circles(r, agents, n_robots, n_humans, flags, circles):
-    """Write all that the lidar of robot r sees of agents; returns how many rows. r = -1: the humans alone.
+    """Write all that the lidar of robot r sees of agents (two legs, a trunk or an ellipse each); returns how many rows.
 
-    The fourth column is the owner: humans from 0, then the other robots.
+    r = -1: the humans alone. The fourth column is the owner: humans from 0, then the other robots.
     """
     count = 0
-    for i in range(n_humans):
-        count += fill_bodies(n_robots + i, agents, i, flags, circles[count:])
-    if r >= 0:
-        owner = n_humans
-        for i in range(n_robots):
-            if i != r:
-                count += fill_bodies(i, agents, owner, flags, circles[count:])
-                owner += 1
+    legs, ellipse = flags[F_LEGS] != 0, flags[F_ELLIPSE] != 0
+    for owner in range(n_humans if r < 0 else n_humans + n_robots - 1):
+        i = n_robots + owner
+        if owner >= n_humans:
+            i = owner - n_humans
+            i += 1 if i >= r else 0
+        if legs:
+            speed = np.hypot(agents[i, A_VX], agents[i, A_VY])
+            leg_circles(
+                agents[i, A_X], agents[i, A_Y], agents[i, A_HEADING], speed,
+                agents[i, A_GAIT_X], agents[i, A_GAIT_Y], agents[i, A_GAIT_T], owner, circles[count : count + 2],
+            )  # fmt: skip
+            count += 2
+        elif ellipse:
+            body_ellipse(
+                agents[i, A_X], agents[i, A_Y], agents[i, A_HEADING], agents[i, A_RADIUS], owner, circles[count]
+            )  # fmt: skip
+            count += 1
+        else:
+            circles[count, 0] = agents[i, A_X]
+            circles[count, 1] = agents[i, A_Y]
+            circles[count, 2] = agents[i, A_RADIUS]
+            circles[count, 3] = owner
+            count += 1
     return count
 
 

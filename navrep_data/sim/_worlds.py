@@ -160,10 +160,8 @@ def _place_humans(agents, robots, scalars, boxes, n_boxes, rng, params, flags):
                 if not _fits(agents, n, A_GX, A_GY, x, y, radius, boxes, 0, gap):
                     continue
             look_x, look_y = gx - x, gy - y
-            if stand:  # for good: off the robots' goals
+            if stand:  # for good; by the test of goals below off everybody's goal, too
                 gx, gy = x, y
-                if not _fits(agents, robots, A_GX, A_GY, x, y, radius, boxes, 0, gap):
-                    continue
             if _fits(agents, n, A_X, A_Y, x, y, radius, boxes, n_boxes, gap) and _fits(
                 agents, n, A_GX, A_GY, gx, gy, radius, boxes, n_boxes, gap
             ):
@@ -212,9 +210,8 @@ def _place_robots(agents, robots, rng, params):
             angle = uniform(rng) * 2.0 * np.pi
             ring = min(ROBOT_RADIUS_CAP, CIRCLE_RADIUS * (1.0 + 2.0 * uniform(rng)))
             x, y = ring * np.cos(angle), ring * np.sin(angle)
-            if _fits(agents, n, A_X, A_Y, x, y, radius, agents, 0, params[P_DANGER_DIST]) and _fits(
-                agents, n, A_GX, A_GY, -x, -y, radius, agents, 0, params[P_DANGER_DIST]
-            ):
+            # goals lie opposite, so they are as far apart as the starts
+            if _fits(agents, n, A_X, A_Y, x, y, radius, agents, 0, params[P_DANGER_DIST]):
                 agents[n, A_X], agents[n, A_Y] = x, y
                 agents[n, A_GX], agents[n, A_GY] = -x, -y
                 placed = True

@@ -141,6 +141,8 @@ class SimConfig:
         _one_of("world", self.world, WORLDS)
         for name in ("maps", "scenarios"):
             object.__setattr__(self, name, _names(name, getattr(self, name)))
+        for name in self.scenarios:
+            get_scenario(name)
         _one_of("human_policy", self.human_policy, HUMAN_POLICIES)
         _whole("robots", self.robots, 1, MAX_ROBOTS)
         _one_of("drive", self.drive, DRIVES)

@@ -187,7 +187,7 @@ class GridMap:
         if self.occupancy.size < DISK_CACHE_CELLS:
             return _read_only(self._distance())
         key = content_hash(self.occupied, float(self.resolution))
-        return _read_only(cached_on_disk("distance", key, self.shape, self._distance))
+        return _read_only(cached_on_disk("distance", key, self.shape, self._distance, np.float32))
 
     def _distance(self) -> NDArray[np.float32]:
         if not self.occupied.any():
@@ -274,7 +274,42 @@ class GridMap:
         _grid_lidar.free_squares(self.occupied, squares)
         return _read_only(squares)
 
-    def contours(self, tolerance: float = 0.0, *, unknown_is_solid: bool = False) -> list[NDArray[np.float64]]:
+    def ground(self, radius: float) -> NDArray[np.bool_]:
+        """Return the cells that some disc on free ground covers: free ground without its narrow ends and gaps.
+
+        Parameters
+        ----------
+        radius : float
+            Radius of the disc [m]; 0 gives the free cells.
+
+        Returns
+        -------
+        ndarray of shape (W, H), bool
+            Unknown cells count as solid, and so does what lies outside the map. Kept in memory; read-only.
+        """
+        if not (math.isfinite(radius) and radius >= 0.0):
+            raise ConfigError(f"radius is {radius}, expected 0 or more metres: correct it.")
+        kept: dict[float, NDArray[np.bool_]] = self.__dict__.setdefault("_ground", {})
+        if radius not in kept:
+            allowed = self.occupancy <= self.free_threshold
+
+            def make() -> NDArray[np.bool_]:
+                ground = np.pad(allowed, 1)
+                for _ in range(2 if radius > 0.0 else 0):
+                    # where the disc's centre may be; then, with solid and ground exchanged, what it covers
+                    ground = ~(ndimage.distance_transform_edt(ground) * self.resolution >= radius)
+                return np.ascontiguousarray(ground[1:-1, 1:-1])
+
+            if allowed.size < DISK_CACHE_CELLS:
+                kept[radius] = _read_only(make())
+            else:
+                key = content_hash(allowed, float(self.resolution), float(radius))
+                kept[radius] = _read_only(cached_on_disk("ground", key, self.shape, make, np.bool_))
+        return kept[radius]
+
+    def contours(
+        self, tolerance: float = 0.0, *, radius: float = 0.0, unknown_is_solid: bool = False
+    ) -> list[NDArray[np.float64]]:
         """Return the outlines of solid matter as polygons, for ORCA and for drawing.
 
         Parameters
@@ -282,8 +317,11 @@ class GridMap:
         tolerance : float
             Largest distance between the polygons and the outline of the cells, either way [m]. 0 gives the cells' own
             outline with collinear corners dropped. From half a cell on, stairs become slopes.
+        radius : float
+            Where positive, everything but :meth:`ground` of this radius is taken for solid [m], also outside the map.
         unknown_is_solid : bool
-            Whether cells that are neither free nor solid count as solid, as they do in :meth:`signed_distance`.
+            Whether cells that are neither free nor solid count as solid, as they do in :meth:`signed_distance`. Always
+            so with a radius.
 
         Returns
         -------
@@ -294,11 +332,17 @@ class GridMap:
         """
         if not (math.isfinite(tolerance) and tolerance >= 0.0):
             raise ConfigError(f"tolerance is {tolerance}, expected 0 or more metres: correct it.")
-        kept: dict[tuple[float, bool], list[NDArray[np.float64]]] = self.__dict__.setdefault("_contours", {})
-        key = (float(tolerance), bool(unknown_is_solid))
+        kept: dict[tuple[float, float, bool], list[NDArray[np.float64]]] = self.__dict__.setdefault("_contours", {})
+        key = (float(tolerance), float(radius), bool(unknown_is_solid))
         if key not in kept:
-            solid = self.occupancy > self.free_threshold if unknown_is_solid else self.occupied
-            outlines = _map_contours.outlines(solid, tolerance / self.resolution)
+            if radius > 0.0:
+                # with a frame of solid cells round the map, whose own outline is left out
+                solid = np.pad(~self.ground(radius), 1, constant_values=True)
+                outlines = _map_contours.outlines(solid, tolerance / self.resolution)
+                outlines = [line - 1.0 for line in outlines if line[:, 0].min() >= 1.0]
+            else:
+                solid = self.occupancy > self.free_threshold if unknown_is_solid else self.occupied
+                outlines = _map_contours.outlines(solid, tolerance / self.resolution)
             kept[key] = [_read_only(line * self.resolution + self.origin) for line in outlines]
         return kept[key]
 

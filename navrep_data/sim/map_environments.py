@@ -61,9 +61,13 @@ MAP_ENVIRONMENTS = _environments()
 
 
 def original_fields(name: str) -> dict[str, Any]:
-    """Return what differs in the config of an environment on maps in `original` physics: how far its lidar sees."""
+    """Return what differs in the config of an environment on maps in `original` physics.
+
+    How far its lidar sees; and its humans are in scenarios only.
+    """
     if name not in MAP_ENVIRONMENTS:
         return {}
     far = FARTHEST if name in ("ian", "map") else FARTHEST_SMALL
     sensor = MAP_ENVIRONMENTS[name][1].get("sensor", SensorContract())
-    return {"sensor": SensorContract(dt=sensor.dt, range_max=far)}
+    fields: dict[str, Any] = {"sensor": SensorContract(dt=sensor.dt, range_max=far)}
+    return {**fields, "humans": 0} if name == "map" else fields

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from navrep_data.errors import MapError
 from navrep_data.sim import _ian_layout as il
-from navrep_data.sim._obstacles import OF_FIELDS, OI_FIELDS
 from navrep_data.sim._map_edges import link_edges
+from navrep_data.sim._obstacles import OF_FIELDS, OI_FIELDS
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.gridmap import GridMap
 from navrep_data.sim.maps import goal_field, load_map, planning_map, planning_speeds
@@ -28,7 +28,7 @@ SPAWN_RESOLUTION = 0.2
 """Other maps are coarsened for this as long as a cell stays below this side [m]."""
 POOL_SIZE = 24
 """Humans without a scenario walk to one of this many places per map, so that their goal fields are kept."""
-CONTOUR_TOLERANCE = 0.05
+CONTOUR_TOLERANCE = 0.03
 """ORCA's walls are off the cells' outline by at most this [m]."""
 WAYPOINT_DISTANCE = 1.0
 """pepper_2d_iarlenv.py: a human's waypoint lies this far ahead along its path [m]."""
@@ -73,9 +73,10 @@ def map_world_data(config: SimConfig) -> MapWorldData:
     names = tuple(dict.fromkeys(s.map for s in scenarios)) if scenarios else config.maps
     maps = tuple(load_map(name) for name in names)
     pool = not scenarios and config.humans > 0
-    key = (config.scenarios, tuple(grid.hash for grid in maps), pool)
+    rim = config.physics == "consistent"
+    key = (config.scenarios, tuple(grid.hash for grid in maps), pool, rim)
     if key not in _kept:
-        _kept[key] = _build(maps, scenarios, names, pool)
+        _kept[key] = _build(maps, scenarios, names, pool, rim)
         while len(_kept) > TABLES_KEPT:
             _kept.popitem(last=False)
     _kept.move_to_end(key)
@@ -102,7 +103,7 @@ class _Flat:
 
 
 def _build(
-    maps: tuple[GridMap, ...], scenarios: tuple[Scenario, ...], names: tuple[str, ...], pool: bool
+    maps: tuple[GridMap, ...], scenarios: tuple[Scenario, ...], names: tuple[str, ...], pool: bool, rim: bool
 ) -> MapWorldData:
     table = np.zeros((len(maps), il.MAP_FIELDS))
     flats = {
@@ -114,7 +115,7 @@ def _build(
     pools: list[int] = []
     for m, grid in enumerate(maps):
         _add_map(table[m], grid, flats)
-        places = np.zeros((0, 2)) if scenarios else spawn_places(grid)
+        places = np.zeros((0, 2)) if scenarios else spawn_places(grid, rim)
         table[m, il.T_SPOTS] = sum(map(len, spots))
         spots.append(places)
         table[m, il.T_SPOTS_END] = table[m, il.T_SPOTS] + len(places)
@@ -176,8 +177,15 @@ class _Fields:
         return self.known[key]
 
 
-def spawn_places(grid: GridMap) -> NDArray[np.float64]:
+def spawn_places(grid: GridMap, off_rim: bool = True) -> NDArray[np.float64]:
     """Return where robots may start and have goals on a map: centres of cells, (N, 2) [m], world frame.
+
+    Parameters
+    ----------
+    grid : GridMap
+        The map at full resolution.
+    off_rim : bool
+        Whether the map's edge counts as a wall.
 
     Raises
     ------
@@ -199,12 +207,18 @@ def spawn_places(grid: GridMap) -> NDArray[np.float64]:
         free = coarse.reachable((0.0, 0.0), SPAWN_CLEARANCE)
     except MapError:
         free = _largest_region(coarse)
-    if not free.any():
+    places: NDArray[np.float64] = coarse.centre_of(np.argwhere(free))
+    if off_rim:
+        left, right, low, high = grid.extent
+        x, y = places.T
+        near = np.minimum(np.minimum(x - left, right - x), np.minimum(y - low, high - y))
+        places = places[near >= SPAWN_CLEARANCE]
+    if len(places) == 0:
         raise MapError(
             f"Map '{grid.name}' has no place that is {SPAWN_CLEARANCE} m from all walls and unknown ground, expected "
             "room for a robot: check resolution, thresholds and the image."
         )
-    return coarse.centre_of(np.argwhere(free))
+    return places
 
 
 _ORIGINAL_SPAWN = frozenset(
@@ -264,14 +278,12 @@ def check_way(
     clearance = float(grid.signed_distance()[tuple(grid.cell_of(start))]) if grid.contains(start) else -np.inf
     if clearance < RADIUS:
         raise MapError(
-            f"Scenario {which!r}: the start ({start[0]:g}, {start[1]:g}) on map '{grid.name}' is {clearance:.2f} m from "
-            f"the nearest wall (negative: inside), expected at least {RADIUS} m: move it."
+            f"Scenario {which!r}: the start ({start[0]:g}, {start[1]:g}) on map '{grid.name}' is {clearance:.2f} m "
+            f"from the nearest wall (negative: inside), expected at least {RADIUS} m: move it."
         )
     plan = planning_map(grid)
     index = fields.index(grid, goal)
-    begin = fields.starts[index]
-    field = np.concatenate(fields.flat.parts[-1:]) if begin + plan.occupancy.size == fields.flat.size else None
-    field = goal_field(plan, goal) if field is None else field.reshape(plan.shape)
+    field = fields.flat.parts[index].reshape(plan.shape)
     if not np.isfinite(field[tuple(plan.cell_of(start))]):
         raise MapError(
             f"Scenario {which!r}: the goal ({goal[0]:g}, {goal[1]:g}) on map '{grid.name}' is out of reach from "
@@ -279,9 +291,7 @@ def check_way(
         )
 
 
-def _edges(
-    maps: tuple[GridMap, ...], table: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def _edges(maps: tuple[GridMap, ...], table: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     outlines = [grid.contours(CONTOUR_TOLERANCE) for grid in maps]
     capacity = max([1, *(sum(map(len, lines)) for lines in outlines)])
     edges_f = np.zeros((len(maps), OF_FIELDS, capacity), np.float32)

@@ -30,7 +30,12 @@ ORCA_ON_MAPS = (5.0, 10.0, 2.0, 1.0)
 HUMAN_SPEEDS = (0.6, 1.0)
 # markenv.py, jointenv.py: environments with several maps are built, and so drawn, twice per reset
 DRAWS_PER_RESET = 2
-_WALKS = {"planned": il.WALK_PLANNED, "orca": il.WALK_ORCA, "static": il.WALK_STATIC, "constant-velocity": il.WALK_CONSTANT}
+_WALKS = {
+    "planned": il.WALK_PLANNED,
+    "orca": il.WALK_ORCA,
+    "static": il.WALK_STATIC,
+    "constant-velocity": il.WALK_CONSTANT,
+}
 
 
 def map_rules(config: SimConfig) -> F64:
@@ -75,7 +80,7 @@ def map_rules(config: SimConfig) -> F64:
 
 
 class MapArrays:
-    """The state of a batch of worlds on maps, and scratch space; names as in ``WorldArrays`` where they mean the same."""
+    """The state of a batch of worlds on maps, and scratch space; names as in ``WorldArrays`` where they agree."""
 
     def __init__(self, config: SimConfig, n_worlds: int, data: MapWorldData) -> None:
         agents = config.robots + config.max_humans
@@ -144,11 +149,15 @@ class MapWorlds:
             chosen, a.worlds, self.data.tables, a.rules, a.flags, streams, seeded, scenarios, headings
         )
         if failed >= 0:
-            grid = self.data.maps[int(a.worlds.place[failed, il.M_MAP])]
-            raise SimulationError(
-                f"No start and goal for {self.config.robots} robots on map '{grid.name}': expected free places more "
-                "than 3 m apart; take fewer robots or a larger map."
-            )
+            raise self.no_place(failed)
+
+    def no_place(self, world: int) -> SimulationError:
+        """Return the error for a world whose map has no room for a start and a goal."""
+        grid = self.data.maps[self.map_index(world)]
+        return SimulationError(
+            f"No start and goal for {self.config.robots} robots on map '{grid.name}': expected free places more "
+            "than 3 m apart; take fewer robots or a larger map."
+        )
 
     def step(self, commands: F64, rewards: F64, events: NDArray[np.uint8]) -> None:
         """Advance all worlds under commands (W, R, 3)."""
@@ -227,5 +236,7 @@ class MapWorlds:
             elif isinstance(value, int) and 0 <= value < len(names):
                 result[w] = value
             else:
-                raise ConfigError(f"Scenario {value!r} is none, expected a name or an index from 0 to {len(names) - 1}.")
+                raise ConfigError(
+                    f"Scenario {value!r} is none, expected a name or an index from 0 to {len(names) - 1}."
+                )
         return result

@@ -90,7 +90,5 @@ def get_scenario(name: str) -> Scenario:
     """
     known = _scenarios()
     if name not in known:
-        raise UnknownNameError(
-            f"Unknown scenario {name!r}.{did_you_mean(name, known)} Known: {', '.join(known)}."
-        )
+        raise UnknownNameError(f"Unknown scenario {name!r}.{did_you_mean(name, known)} Known: {', '.join(known)}.")
     return known[name]

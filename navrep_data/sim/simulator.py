@@ -223,7 +223,9 @@ class Simulator:
         if headings is not None:
             fixed = np.asarray(headings, np.float64)
             if fixed.shape != (self.n_worlds,) or not np.isfinite(fixed[chosen]).all():
-                raise ConfigError(f"headings have shape {fixed.shape}, expected ({self.n_worlds},) finite angles [rad].")
+                raise ConfigError(
+                    f"headings have shape {fixed.shape}, expected ({self.n_worlds},) finite angles [rad]."
+                )
         if numpy_seeds is None:
             self.maps.reset(chosen, self.arrays.rng, scenarios=indices, headings=fixed)
         else:
@@ -239,7 +241,7 @@ class Simulator:
             )
         if (seeds[chosen] < 0).any() or (seeds[chosen] > MAX_NUMPY_SEED).any():
             raise ConfigError(f"numpy_seeds are {seeds.tolist()}, expected whole numbers from 0 to {MAX_NUMPY_SEED}.")
-        streams = np.zeros_like(self.arrays.rng)
+        streams = np.zeros((self.n_worlds, lay.RNG_WORDS), np.uint64)
         _batch.seed_legacy(streams, np.where(chosen, seeds, 0).astype(np.uint64), chosen)
         return streams
 
@@ -359,11 +361,13 @@ class Simulator:
 
     def robot_events(self) -> NDArray[np.uint8]:
         """Return what the last step led to for each robot, (W, R) uint8 event codes."""
-        return self.arrays.agents[:, : self.config.robots, lay.A_EVENT].astype(np.uint8)
+        events: NDArray[np.uint8] = self.arrays.agents[:, : self.config.robots, lay.A_EVENT].astype(np.uint8)
+        return events
 
     def damage(self) -> F64:
         """Return the damage that each robot has taken since reset, (W, R) [m/s]; 0 unless ``on_collision="damage"``."""
-        return self.arrays.agents[:, : self.config.robots, lay.A_DAMAGE].copy()
+        taken: F64 = self.arrays.agents[:, : self.config.robots, lay.A_DAMAGE].copy()
+        return taken
 
     def difficulty(self) -> NDArray[np.int64]:
         """Return the present setting of `humans` and `obstacles` in each world, (W, 2): what the curriculum adapts."""

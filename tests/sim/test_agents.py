@@ -62,9 +62,11 @@ def test_cadrl_has_humans_as_trunks_and_no_border(physics):
 
 @pytest.mark.parametrize("crossing", ["circle", "square"])
 def test_static_humans_stand_on_both_legs_off_everybodys_goal(crossing):
-    sim = Simulator(make_config("soadrl", human_policy="static", crossing=crossing), n_worlds=20, seed=3)
+    n = 80
+    config = make_config("soadrl", human_policy="static", crossing=crossing, humans=40, obstacles=2)
+    sim = Simulator(config, n_worlds=n, seed=3)
     start = sim.arrays.agents.copy()
-    for w in range(20):
+    for w in range(n):
         state = sim.state(w)
         off = np.hypot(*(state.humans[:, :2] - state.robot[3:5]).T) - state.humans[:, 7] - state.robot[5]
         assert off.min() >= 0.2
@@ -74,7 +76,7 @@ def test_static_humans_stand_on_both_legs_off_everybodys_goal(crossing):
         np.testing.assert_allclose(np.hypot(*(legs[:, 0] - legs[:, 1]).T), 2 * np.hypot(0.01, 0.2))
     assert len(np.unique(sim.arrays.agents[0, 1:10, lay.A_HEADING])) == 9, "they look in all directions"
     for _ in range(5):
-        sim.step(np.zeros((20, 3)))
+        sim.step(np.zeros((n, 3)))
     np.testing.assert_array_equal(sim.arrays.agents[:, 1:, :13], start[:, 1:, :13])
 
 

@@ -30,13 +30,21 @@ OTHERWISE = {
 }  # fmt: skip
 
 # one example for every rule of the table, in its order
+ON_MAP = {"world": "map", "maps": ("asl",), "humans": 0, "obstacles": 0, "human_policy": "planned"}
 EXAMPLES = [
     {"world": "empty"},
     {"maps": ("asl",)},
     {"scenarios": ("rlasl1",)},
     {"world": "map"},
+    {**ON_MAP, "scenarios": ("rlasl1",)},
+    {**ON_MAP, "maps": (), "scenarios": ("rlasl1",), "humans": 2},
+    {**ON_MAP, "maps": (), "scenarios": ("rlasl1",), "robots": 2},
+    {**ON_MAP, "obstacles": 10},
+    {**ON_MAP, "physics": "original", "human_policy": "orca"},
+    {**ON_MAP, "physics": "original", "humans": 2},
+    {**ON_MAP, "physics": "original", "robots": 2, "on_collision": "damage"},
     {"human_policy": "planned"},
-    {"world": "map", "maps": ("asl",), "curriculum": "adaptive"},
+    {**ON_MAP, "curriculum": "adaptive"},
     {"physics": "original", "robots": 2},
     {"physics": "original", "on_collision": "damage"},
     {"physics": "original", "rendering": "ellipse"},
@@ -56,7 +64,7 @@ def test_configs_survive_json():
     assert {*OTHERWISE} - {*stored} == set()
     assert stored["max_velocity"] == [0.5, 0.4, 2.0]
     assert SimConfig.from_dict(json.loads(json.dumps(config.full_dict()))) == config
-    on_map = SimConfig(world="map", maps=["asl", "/own/map"], human_policy="planned")
+    on_map = SimConfig(**{**ON_MAP, "maps": ["asl", "/own/map"]})
     assert SimConfig.from_dict(json.loads(json.dumps(on_map.to_dict()))).maps == ("asl", "/own/map")
 
 
@@ -145,7 +153,7 @@ def test_full_actions_mean_the_largest_velocity():
     config = make_config("soadrl", max_velocity=(0.55, 0.5, 2.0))
     np.testing.assert_allclose(scale_actions(config, [[1.0, -0.5, 0.5]]), [[0.55, -0.25, 1.0]])
     np.testing.assert_allclose(scale_actions(config, [3.0, -4.0]), [0.55, -0.5, 0.0])
-    on_map = SimConfig(world="map", maps=("asl",), max_velocity=(0.55, 0.55, 2.0))
+    on_map = SimConfig(**ON_MAP, max_velocity=(0.55, 0.55, 2.0))
     np.testing.assert_allclose(
         scale_actions(on_map, [[1.0, 1.0, 1.0], [0.3, 0.4, -1.0]]),
         [[0.55 / np.sqrt(2), 0.55 / np.sqrt(2), 2.0], [0.165, 0.22, -2.0]],

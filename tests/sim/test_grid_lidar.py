@@ -240,7 +240,7 @@ def test_scans_of_the_original_test_environment(shared):
     runs = json.loads((shared / "reference" / "ian_env_reference.json").read_text())["runs"]
     equal = total = 0
     overlooked = []
-    for run in runs:
+    for run in runs[1:2] if PURE_PYTHON else runs:
         name = run["scenario"].removeprefix("iros").removeprefix("rl").rstrip("0123456789")
         try:
             a_map = load_map(name)
@@ -257,7 +257,7 @@ def test_scans_of_the_original_test_environment(shared):
             total += more.size
             for k in np.flatnonzero(more > 2e-4):
                 overlooked.append(chord(a_map, pose, pose[2] + 60 * k * FINE.angle_increment, found[k]))
-    assert total > 300
+    assert total > (80 if PURE_PYTHON else 300)
     assert equal > 0.85 * total
     assert len(overlooked) < 0.06 * total
     assert max(overlooked) < 0.75

@@ -18,7 +18,8 @@ def tables(solid: np.ndarray, resolution: float, x0: float, y0: float) -> tuple[
     distance = ndimage.distance_transform_edt(~solid) if solid.any() else np.full(solid.shape, np.inf)
     empty = np.zeros(1)
     maps = il.MapTables(
-        table=row[None], solid=solid.astype(np.uint8).ravel(), distance=(distance * resolution).astype(np.float32).ravel(),
+        table=row[None], solid=solid.astype(np.uint8).ravel(),
+        distance=(distance * resolution).astype(np.float32).ravel(),
         squares=np.zeros(1, np.uint8), pace=np.zeros(1, np.float32), fields=np.zeros(1, np.float32),
         field_start=np.zeros(1, np.int64), field_goal=np.zeros((1, 2)), scenarios=np.zeros((0, 3), np.int64),
         cast=np.zeros((0, il.CAST_FIELDS)), spots=np.zeros((0, 2)), pool=empty.astype(np.int64),
@@ -47,8 +48,9 @@ def test_swept_distance_equals_dense_sampling(share: float) -> None:
         maps, row = tables(solid, resolution, x0, y0)
         size = np.array(solid.shape) * resolution
         for _ in range(25):
-            a = np.array([x0, y0]) + rng.random(2) * size
-            b = np.clip(a + rng.normal(0.0, 0.15, 2) * (trial % 3), [x0, y0], [x0, y0] + size - 1e-9)
+            low = np.array([x0, y0])
+            a = low + rng.random(2) * size
+            b = np.clip(a + rng.normal(0.0, 0.15, 2) * (trial % 3), low, low + size - 1e-9)
             wanted = oracle(solid, resolution, x0, y0, a, b)
             for reach in (0.2, 0.5, 50.0):
                 seen = _ian_contact.swept_cells(maps, row, *a, *b, reach)

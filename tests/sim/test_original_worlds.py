@@ -213,10 +213,12 @@ def test_episodes_are_numbered_as_in_the_original():
 @pytest.mark.parametrize("env", environment_names())
 def test_every_environment_runs_in_both_physics(env, physics):
     sim = Simulator(make_config(env, physics=physics), seed=3)
-    rewards, events = sim.step([[0.3, 0.0, 0.1]])
+    robots = sim.config.robots
+    command = np.array([[0.3, 0.0, 0.1]])
+    rewards, events = sim.step(command if robots == 1 else np.tile(command[:, None], (1, robots, 1)))
     scans, states = sim.observe()
-    assert np.isfinite([*rewards, *states[0]]).all()
-    assert 0 < scans.min() <= scans.max() <= 25
+    assert np.isfinite([*rewards.ravel(), *states.ravel()]).all()
+    assert 0 < scans.min() <= scans.max() <= np.float32(sim.config.sensor.range_max)
     assert events[0] >= 0
     assert repr(sim) == f"Simulator({env}, {physics}, n_worlds=1)"
 

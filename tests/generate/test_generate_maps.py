@@ -1,0 +1,57 @@
+"""Datasets in worlds on maps: made by the same generator, the same bytes however they were made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from navrep_data.generate import generate, regenerate
+from navrep_data.shards import Manifest, read_worlds, verify
+from navrep_data.sim import load_map
+
+
+@pytest.fixture
+def hall(tmp_path: Path) -> str:
+    """Return a map of 12 x 9 m with a wall that leaves a gap."""
+    grey = np.full((90, 120), 254, np.uint8)
+    grey[[0, -1], :] = grey[:, [0, -1]] = 0
+    grey[:60, 58:60] = 0
+    folder = tmp_path / "hall"
+    folder.mkdir()
+    Image.fromarray(grey).save(folder / "hall.png")
+    (folder / "hall.yaml").write_text(
+        "image: hall.png\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
+        encoding="utf-8",
+    )
+    return str(folder)
+
+
+def toward_goal(scan: np.ndarray, state: np.ndarray) -> np.ndarray:
+    """Go straight to the goal."""
+    gap = np.linalg.norm(state[:, :2], axis=1, keepdims=True)
+    return 0.5 * state[:, :2] / np.maximum(gap, 0.5)
+
+
+@pytest.mark.parametrize("policy", ["orca", toward_goal])
+def test_dataset_on_an_own_map(hall: str, tmp_path: Path, policy: object) -> None:
+    kwargs = {"env": "map", "maps": [hall], "humans": 3, "length": 60, "seed": 3, "policy": policy, "policy_batch": 4}
+    size = 4 if callable(policy) else 3
+    generate(n=3, out=tmp_path / "a", shard_size=size, **kwargs)
+    root = tmp_path / "a"
+    assert verify(root).problems == []
+    manifest = Manifest.read(root)
+    assert manifest.config["maps"] == [hall]
+    worlds = read_worlds(root / manifest.shards[0].worlds.file)
+    first = worlds.episode(0)
+    assert (first.map, first.map_hash, first.scenario) == ("hall", load_map(hall).hash, "")
+    assert first.polygons == ()
+    assert len(first.human_start) <= 4
+    generate(n=2, out=tmp_path / "b", shard_size=size, **kwargs)
+    fewer = Manifest.read(tmp_path / "b")
+    assert fewer.shards[0].sequence_hashes == manifest.shards[0].sequence_hashes[:2]
+    if not callable(policy):
+        report = regenerate(root, 2)
+        assert [found.verdict for found in report.comparisons] == ["equal bytes"] * 2
