@@ -36,8 +36,7 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         ``"consistent"`` (default) or ``"original"``.
     episode : int, optional
         Number of the episode that the first bare reset plays, in environments with numbered episodes
-        (``navrep-test``: 500, ``navrep-val``: 50, ``ian``: any); later ones play the next, and the first again after the
-        last.
+        (``navrep-test``: 500, ``navrep-val``: 50, ``ian``: any); later ones play the next, after the last the first.
     render_mode : str, optional
         ``"rgb_array"``: :meth:`render` returns a picture; ``"human"``: a window that follows each step.
     pad_humans : bool
@@ -68,14 +67,14 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     ``info`` holds, after reset and after each step: ``robot`` (3,) x, y, theta; ``humans`` (n, 4) x, y, vx, vy, world
     frame; ``event``, the reason why the episode ended, or ``"none"``; in environments with numbered episodes ``seed``,
-    the numpy seed of the episode; with scenarios ``scenario``, the name. With several robots observations, actions and ``info["robot"]`` have a
-    leading axis of robots, the reward is their mean and ``info["rewards"]`` each one's.
+    the numpy seed of the episode; with scenarios ``scenario``, the name. With several robots observations, actions and
+    ``info["robot"]`` have a leading axis of robots, the reward is their mean and ``info["rewards"]`` each one's.
 
     ``reset(seed=s)`` plays numpy seed s in environments with numbered episodes, later bare resets s + 1, s + 2, ...;
     ``reset(options={"episode": k})`` plays number k: numpy seed 1000 + k of ``navrep-test`` (500 of them), k of
-    ``navrep-val`` (50), and in ``ian`` scenario k modulo 27 with numpy seed k, as in the suite `navrep27`. Without a seed
-    ``ian`` starts anywhere, the others with number 0. In environments without numbers s names a random stream, which
-    later bare resets go on with.
+    ``navrep-val`` (50), and in ``ian`` scenario k modulo 27 with numpy seed k, as in the suite `navrep27`. Without
+    a seed ``ian`` starts anywhere, the others with number 0. In environments without numbers s names a random stream,
+    which later bare resets go on with.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}  # noqa: RUF012

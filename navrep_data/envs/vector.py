@@ -56,8 +56,9 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
     Observations are dictionaries of arrays with a leading axis of worlds; rewards (N,) float64; terminations and
     truncations (N,) bool. ``infos`` follow gymnasium's convention, ``_key`` (N,) bool saying for whom a value holds:
     ``robot`` (N, 3), ``humans`` (N, most humans, 4) with NaN in empty slots, ``event`` (N,) str, ``seed`` (N,) and
-    ``scenario`` (N,) where there are such. Where episodes ended, ``final_obs`` (N,) holds their last observations (None elsewhere) and
-    ``final_info`` the infos of their last steps, with the reason; observations are those of the next episodes.
+    ``scenario`` (N,) where there are such. Where episodes ended, ``final_obs`` (N,) holds their last observations (None
+    elsewhere) and ``final_info`` the infos of their last steps, with the reason; observations are those of the next
+    episodes.
 
     ``reset(options={"reset_mask": mask})`` resets some worlds only.
     """
@@ -206,7 +207,9 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
             infos |= {"seed": np.where(mask, self._worlds.seeds, 0), "_seed": mask.copy()}
         names = self._worlds.scenarios()
         if names:
-            infos |= {"scenario": np.where(mask, np.array(names, object), None), "_scenario": mask.copy()}
+            scenarios = np.array(names, object)
+            scenarios[~mask] = None
+            infos |= {"scenario": scenarios, "_scenario": mask.copy()}
         if rewards is not None and stepped is not None and stepped.any():
             infos |= {"rewards": rewards * stepped[:, None], "_rewards": stepped}
         return infos

@@ -194,13 +194,14 @@ class Worlds:
 
     def robots(self) -> F64:
         """Return x, y [m], theta [rad] of the robots, (n, 3) or (n, robots, 3), world frame."""
-        agents = self.sim.arrays.agents
+        agents: F64 = self.sim.arrays.agents
         return agents[:, 0, _POSE] if not self._lead else agents[:, : self._lead[0], _POSE]
 
     def humans(self) -> F64:
         """Return x, y [m], vx, vy [m/s] of the humans, (n, most humans, 4), world frame; NaN in empty slots."""
         first = self.config.robots
-        out = self.sim.arrays.agents[:, first:, _MOTION]
+        agents: F64 = self.sim.arrays.agents
+        out = agents[:, first:, _MOTION]
         out[np.arange(out.shape[1]) >= self.human_counts()[:, None]] = np.nan
         return out
 
@@ -216,7 +217,8 @@ class Worlds:
 
     def human_counts(self) -> NDArray[np.int64]:
         """Return the number of humans in each world, (n,)."""
-        return self.sim.arrays.scalars[:, lay.S_HUMANS].astype(np.int64)
+        scalars: F64 = self.sim.arrays.scalars
+        return scalars[:, lay.S_HUMANS].astype(np.int64)
 
 
 def _has_numbers(env: str) -> bool:
