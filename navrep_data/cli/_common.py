@@ -8,6 +8,9 @@ from typing import Any
 
 import typer
 
+INTERRUPTED = 130
+INTERRUPTED_LINE = "Interrupted. What was finished is intact; run the same command again to go on."
+
 
 def say(text: str) -> None:
     """Print a line for people to stdout."""

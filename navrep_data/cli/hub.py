@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+import threading
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from navrep_data.cli._common import print_json, say, show_progress
+from navrep_data.cli._common import INTERRUPTED, INTERRUPTED_LINE, print_json, say, show_progress
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Repo = Annotated[str, typer.Argument(metavar="USER/NAME", help="Repository on the Hugging Face Hub.")]
@@ -23,17 +26,29 @@ LICENSE_QUESTION = "Licence to publish it under (cc-by-4.0, cc0-1.0, mit, other,
 
 def _licence(given: str | None, known: str | None) -> str | None:
     """Return the licence: given, known, or asked for where somebody is there to answer."""
-    _quiet_client()
+    _prepare()
     if given or known or not sys.stdin.isatty():
         return given or known
     return str(typer.prompt(LICENSE_QUESTION, err=True)).strip()
 
 
-def _quiet_client() -> None:
-    """Leave it to our errors to tell what went wrong, in one line."""
+def _prepare() -> None:
+    """Leave it to our errors to tell what went wrong, in one line, and let Ctrl-C end it at once."""
     from huggingface_hub.utils import logging
 
     logging.set_verbosity_error()  # type: ignore[no-untyped-call]
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, _stop)
+
+
+def _stop(*_: object) -> None:
+    """End the process: huggingface_hub would wait for its threads, minutes where a server stalls.
+
+    At any moment what lies on the disk and on the Hub is whole: files appear by renaming, a push is one commit.
+    """
+    sys.stderr.write(f"{INTERRUPTED_LINE}\n")
+    sys.stderr.flush()
+    os._exit(INTERRUPTED)
 
 
 def push_command(
@@ -80,7 +95,7 @@ def pull_command(
     """
     from navrep_data.datasets.hub import parse_shards, pull
 
-    _quiet_client()
+    _prepare()
     chosen = None if shards is None else parse_shards(shards)
     result = pull(repo, out, revision=revision, split=split, shards=chosen, progress=show_progress())
     if as_json:

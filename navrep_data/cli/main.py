@@ -23,6 +23,7 @@ from navrep_data.cli import (
     verify,
     view,
 )
+from navrep_data.cli._common import INTERRUPTED, INTERRUPTED_LINE
 from navrep_data.errors import NavrepDataError, did_you_mean
 
 app = typer.Typer(
@@ -52,7 +53,6 @@ app.add_typer(evaluate.evaluate_app, name="evaluate")
 _UsageError: type[Any] = typer.BadParameter.__mro__[1]
 _ClickException: type[Any] = _UsageError.__mro__[1]
 USAGE_ERROR = 2
-INTERRUPTED = 130
 
 
 def _print_version(value: bool) -> None:
@@ -81,7 +81,7 @@ def run(arguments: list[str] | None = None) -> None:
     try:
         code = app(arguments, standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
-        typer.echo("Interrupted. What was finished is intact; run the same command again to go on.", err=True)
+        typer.echo(INTERRUPTED_LINE, err=True)
         code = INTERRUPTED
     except BrokenPipeError:  # the reader of our output has gone, as in `navrep-data info DIR | head`
         sys.stderr.close()
