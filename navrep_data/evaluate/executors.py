@@ -7,7 +7,7 @@ import time
 import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any
 
 from navrep_data.errors import NavrepDataError, WorkerDiedError
@@ -85,6 +85,7 @@ def run(job: Job, workers: int) -> Iterator[list[Episode]]:
 def _work(job: Job, share: int, taken: Any, results: Any) -> None:
     """Play in a worker process; `taken` counts the units that somebody has taken."""
     todo = job.units()
+    parent = parent_process()
 
     def take() -> list[int] | None:
         with taken.get_lock():
@@ -97,7 +98,9 @@ def _work(job: Job, share: int, taken: Any, results: Any) -> None:
         due = time.monotonic() + HAND_OVER_SECONDS
         for finished in _start(job, get_suite(job.suite), take, share):
             done += finished
-            if done and time.monotonic() > due:
+            if time.monotonic() > due:
+                if parent is not None and not parent.is_alive():
+                    return  # nobody is left to take results
                 results.put(("episodes", done))
                 done, due = [], time.monotonic() + HAND_OVER_SECONDS
         results.put(("episodes", done))
