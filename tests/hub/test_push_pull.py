@@ -287,7 +287,7 @@ def test_revisions_are_checked(hub, tmp_path):
 # ---- failures on the way down ----
 
 
-@pytest.mark.parametrize("every", [4099, 1 << 16, pytest.param(331, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [4099, 1 << 16, pytest.param(1031, marks=pytest.mark.slow)])
 def test_connections_cut_every_k_bytes(hub, pushed, template, tmp_path, every):
     hub.cut_every = every
     got = pull(REPO, tmp_path / "got")
