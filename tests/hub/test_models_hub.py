@@ -28,6 +28,12 @@ from navrep_data.zoo.policy import Policy
 REPO = "user/brain"
 
 
+def few(cases, n):
+    """The first n cases in quick runs, all of them in slow ones."""
+    wrap = [case if isinstance(case, tuple) else (case,) for case in cases]
+    return [*cases[:n], *(pytest.param(*case, marks=pytest.mark.slow) for case in wrap[n:])]
+
+
 def a_policy(features="z", name="mine_1d_z"):
     torch.manual_seed(0)
     n = {"z": 8 + 5, "h": 5 + 16, "zh": 8 + 5 + 16}[features]
@@ -64,7 +70,7 @@ def world_model():
 # ---- folders ----
 
 
-@pytest.mark.parametrize("features", ["z", "h", "zh"])
+@pytest.mark.parametrize("features", few(["z", "h", "zh"], 1))
 def test_a_policy_folder(tmp_path, features, monkeypatch):
     policy = a_policy(features)
     zoo.save_policy(policy, tmp_path / "p", {"run": 1})
@@ -79,7 +85,7 @@ def test_a_policy_folder(tmp_path, features, monkeypatch):
         zoo.save_policy(policy, tmp_path / "p")
 
 
-@pytest.mark.parametrize("kind", ["vae", "memory", "joint", "transformer", "modular"])
+@pytest.mark.parametrize("kind", few(["vae", "memory", "joint", "transformer", "modular"], 1))
 def test_a_checkpoint_folder(tmp_path, kind, monkeypatch):
     small = {} if kind in ("vae", "memory") else {"lidar": "1d"}
     module = checkpoint.make(kind, small)
@@ -113,17 +119,20 @@ def test_names_stay_names(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [
-        ({"format": "x"}, "not the description of a policy"),
-        ({"format_version": 2}, "format version 2, expected 1"),
-        ({"features": "y"}, "features is 'y'"),
-        ({"parts": ["controller", "../../x"]}, "parts is"),
-        ({"context": "whatever"}, "context is"),
-        ({"sensor": {"n_rays": "1"}}, "sensor is no sensor contract"),
-        ({"name": 3}, "name or metadata"),
-        ({"lidar": "rings"}, "is for rings, its V for 1d"),
-        ({"features": "h"}, "expected a world model"),
-    ],
+    few(
+        [
+            ({"format": "x"}, "not the description of a policy"),
+            ({"format_version": 2}, "format version 2, expected 1"),
+            ({"features": "y"}, "features is 'y'"),
+            ({"parts": ["controller", "../../x"]}, "parts is"),
+            ({"context": "whatever"}, "context is"),
+            ({"sensor": {"n_rays": "1"}}, "sensor is no sensor contract"),
+            ({"name": 3}, "name or metadata"),
+            ({"lidar": "rings"}, "is for rings, its V for 1d"),
+            ({"features": "h"}, "expected a world model"),
+        ],
+        2,
+    ),
 )
 def test_a_policy_that_is_none(tmp_path, change, words):
     path = zoo.save_policy(a_policy(), tmp_path / "p")
@@ -153,7 +162,7 @@ def test_a_world_model_goes_up_and_comes_down(hub, template, tmp_path):
     assert push_model(tmp_path / "m", REPO, license="mit").commit == pushed.commit
 
 
-@pytest.mark.parametrize("features", ["z", "zh"])
+@pytest.mark.parametrize("features", few(["z", "zh"], 1))
 def test_a_policy_goes_up_and_comes_down(hub, tmp_path, features):
     policy = a_policy(features)
     zoo.save_policy(policy, tmp_path / "p")
@@ -229,16 +238,19 @@ def test_only_what_loads_is_published(hub, tmp_path):
 
 @pytest.mark.parametrize(
     ("files", "words"),
-    [
-        ([], "is not a list of a model's files"),
-        ([{"file": "../../x", "sha256": "0" * 64, "bytes": 1}], "names a file '../../x'"),
-        ([{"file": "model.pkl", "sha256": "0" * 64, "bytes": 1}], "names a file 'model.pkl'"),
-        ([{"file": "config.json", "sha256": "x", "bytes": 1}], "has no SHA-256 or size for config.json"),
-        ([{"file": "config.json", "sha256": "0" * 64, "bytes": 3 << 30}], r"lists more than [\d,]+ bytes"),
-        ([{"file": "config.json", "sha256": "0" * 64, "bytes": 1}], "holds another config.json"),
-        ([{"file": "vae/config.json", "sha256": "0" * 64, "bytes": 1}], "lacks vae/config.json"),
-        (3, "is not a list of a model's files"),
-    ],
+    few(
+        [
+            ([], "is not a list of a model's files"),
+            ([{"file": "../../x", "sha256": "0" * 64, "bytes": 1}], "names a file '../../x'"),
+            ([{"file": "model.pkl", "sha256": "0" * 64, "bytes": 1}], "names a file 'model.pkl'"),
+            ([{"file": "config.json", "sha256": "x", "bytes": 1}], "has no SHA-256 or size for config.json"),
+            ([{"file": "config.json", "sha256": "0" * 64, "bytes": 3 << 30}], r"lists more than [\d,]+ bytes"),
+            ([{"file": "config.json", "sha256": "0" * 64, "bytes": 1}], "holds another config.json"),
+            ([{"file": "vae/config.json", "sha256": "0" * 64, "bytes": 1}], "lacks vae/config.json"),
+            (3, "is not a list of a model's files"),
+        ],
+        3,
+    ),
 )
 def test_a_list_that_asks_for_too_much(hub, tmp_path, files, words):
     checkpoint.save(checkpoint.make("controller", {}), tmp_path / "m")
