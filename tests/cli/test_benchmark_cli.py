@@ -22,6 +22,7 @@ def played(tmp_path_factory):
     return out, run("random", "goal", "--episodes", 5, "--out", out, "--json")
 
 
+@pytest.mark.slow
 def test_json_is_one_object_with_results(played):
     out, done = played
     assert done.returncode == 0, done.stderr
@@ -69,6 +70,7 @@ def test_errors_are_one_line(arguments, words, tmp_path):
     assert len(done.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_without_the_maps_the_error_gives_the_command(tmp_path, monkeypatch):
     """A package of that name that cannot be found is what a missing extra looks like."""
     code = (

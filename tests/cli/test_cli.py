@@ -34,6 +34,7 @@ def test_generate_tells_plan_outcome_and_what_to_do_next(dataset):
     assert lines[-1] == f"next: navrep-data info {root}"
 
 
+@pytest.mark.slow
 def test_json_is_one_object_on_stdout(tmp_path):
     done = run("generate", "--n", 2, "--out", tmp_path / "d", "--json", *FLAGS)
     found = json.loads(done.stdout)
@@ -108,6 +109,7 @@ def test_debug_shows_the_traceback(tmp_path):
     assert "DatasetNotFoundError" in done.stderr
 
 
+@pytest.mark.slow
 def test_no_arguments_show_help():
     done = run()
     assert "generate" in done.stdout + done.stderr
@@ -115,6 +117,7 @@ def test_no_arguments_show_help():
     assert run("--version").stdout.startswith("navrep-data 0.")
 
 
+@pytest.mark.slow
 def test_help_is_quick_and_does_not_load_torch():
     code = (
         "import sys\nfrom navrep_data.cli.main import run\n"

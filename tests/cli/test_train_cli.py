@@ -31,6 +31,7 @@ def call(capsys, *arguments):
 FAST = ["--threads", 1, "--set", "validate_batches=1"]
 
 
+@pytest.mark.slow
 def test_v_codes_m_and_their_error(dataset, tmp_path, capsys):
     v, codes, m = tmp_path / "v", tmp_path / "codes", tmp_path / "m"
     small = ["--set", "z_size=4", "--set", "micro_batch=8"]

@@ -83,6 +83,7 @@ def test_default_fields_hold_the_rows_and_zeros_past_the_episode(made, lidar, pr
         assert not torch.isnan(window[name]).any()
 
 
+@pytest.mark.slow
 def test_rings_are_computed_where_the_dataset_has_none(made, tmp_path):
     root, _ = made
     write_dataset(
@@ -149,6 +150,7 @@ def test_an_episodes_last_row_has_no_target(made):
     assert batch["next_mask"].sum(1).tolist() == [32, 7, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preload", [False, True])
 @pytest.mark.parametrize("stride", [32, 5])
 def test_leading_is_taken_one_row_later(made, stride, preload):
@@ -299,6 +301,7 @@ def loader_multiset(dataset, workers, context=None):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preload", [False, True])
 def test_workers_yield_the_same_multiset(made, preload):
     root, contents = made
@@ -362,6 +365,7 @@ def test_pickle(made):
         assert all(torch.equal(value, copy[i][name]) for name, value in dataset[i].items())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="needs /proc")
 def test_few_files_stay_open(tmp_path):
     write_dataset(tmp_path / "d", [[3]] * 30, shard_size=1)

@@ -161,6 +161,7 @@ def test_windows_of_an_import_hold_no_nan(tmp_path):
     assert not odd["action_valid"].any()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not ORIGINAL.is_dir(), reason="needs ../shared/reference/original_npz")
 def test_the_original_files(tmp_path):
     files = sorted(ORIGINAL.glob("*.npz"))

@@ -14,6 +14,7 @@ def root(tmp_path_factory):
     return tiny_dataset(tmp_path_factory.mktemp("loading") / "d")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "dataset_of", [lambda r: SequenceDataset(r, "rings", window=8), lambda r: ScanDataset(r, "1d")]
 )

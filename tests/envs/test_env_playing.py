@@ -104,6 +104,7 @@ def test_the_robot_goes_where_the_keys_say(hands):
     assert np.linalg.norm(moved) > 0.9
 
 
+@pytest.mark.slow
 def test_restart_and_endings(hands):
     env = NavRepEnv("navrep-test", episode=7, time_limit=1.0, humans=0, obstacles=0)
     person = hands([(3, "press", "r")])

@@ -49,6 +49,7 @@ def test_importing_the_package_loads_neither_gymnasium_nor_numpy():
     assert python(f"import sys, navrep_data; print([m for m in {heavy} if m in sys.modules])") == "[]"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "code",
     [

@@ -15,6 +15,7 @@ def check_env():
     return pytest.importorskip("stable_baselines3.common.env_checker").check_env
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env", "physics"), CASES)
 def test_passes_stable_baselines3s_checker(check_env, env, physics):
     joint = make_config(env).robots > 1

@@ -90,6 +90,7 @@ def test_nobodys_seed_is_another_world_each_time():
     assert len(set(scans)) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env", "physics"), CASES)
 def test_info_says_where_everybody_is(env, physics):
     world = NavRepEnv(env, physics=physics)

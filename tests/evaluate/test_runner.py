@@ -117,6 +117,7 @@ def test_thin_keeps_first_and_last():
     assert thin(path[:3]).tolist() == [[0, 0], [1, 0], [2, 0]]
 
 
+@pytest.mark.slow
 def test_results_are_extended_and_read_back(tmp_path):
     few = benchmark(["goal"], episodes=5, out=tmp_path, figures=False)
     assert few.rows[0]["episodes"] == 5

@@ -84,6 +84,7 @@ def test_a_dream_is_fed_itself_and_the_real_actions():
     assert not torch.equal(a[:, 2:], b[:, 2:])
 
 
+@pytest.mark.slow
 def test_table_and_figure(dataset, tmp_path):
     results = [
         world_model_error(make(k), dataset, split="val", steps=2, limit=2, name=k) for k in ("joint", "transformer")

@@ -278,6 +278,7 @@ def test_too_little_disk_is_said_before_anything_is_written(tmp_path, monkeypatc
     assert not (tmp_path / "d").exists()
 
 
+@pytest.mark.slow
 def test_disk_full_in_the_middle_keeps_what_is_finished(reference, tmp_path):
     """A real limit on file size: larger shards cannot be written, the smaller last one can."""
     root = tmp_path / "d"

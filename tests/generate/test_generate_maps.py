@@ -35,6 +35,7 @@ def toward_goal(scan: np.ndarray, state: np.ndarray) -> np.ndarray:
     return 0.5 * state[:, :2] / np.maximum(gap, 0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["orca", toward_goal])
 def test_dataset_on_an_own_map(hall: str, tmp_path: Path, policy: object) -> None:
     kwargs = {"env": "map", "maps": [hall], "humans": 3, "length": 60, "seed": 3, "policy": policy, "policy_batch": 4}

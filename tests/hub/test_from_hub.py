@@ -81,6 +81,7 @@ def test_from_hub_offline(hub, pushed, monkeypatch):
     assert len(hub.seen) == seen
 
 
+@pytest.mark.slow
 def test_a_damaged_file_in_the_cache_is_replaced(hub, pushed, template):
     there = SequenceDataset.from_hub(REPO, "1d", window=8)
     blob = (there.root / "data" / "shard-00000.h5").resolve()
@@ -107,6 +108,7 @@ def windows(dataset):
     return sorted((int(w["sequence"][0]), int(w["step"][0]), w["scan"].sum().item()) for w in dataset)
 
 
+@pytest.mark.slow
 def test_streaming_yields_the_windows_of_the_dataset(hub, pushed, template):
     options = {"window": 8, "fields": ["sequence", "step"], "buffer_sequences": 2, "seed": 3}
     stream = StreamingSequenceDataset.from_hub(REPO, "1d", **options)
@@ -145,6 +147,7 @@ def held(folder):
     return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file() and p.suffix != ".lock")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prefetch", [0, 2])
 def test_the_cache_stays_within_its_bound(hub, pushed, template, tmp_path, monkeypatch, prefetch):
     sizes = shard_bytes(template)
@@ -218,6 +221,7 @@ def test_streaming_without_an_index_reads_every_shard_once(hub, pushed, template
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words"),
     few(
@@ -250,6 +254,7 @@ def test_an_index_that_lies_is_found(hub, template, monkeypatch, change, words):
         list(StreamingSequenceDataset.from_hub(REPO, "1d", window=8, prefetch=0))
 
 
+@pytest.mark.slow
 def test_a_shard_that_cannot_be_had_is_an_error_of_the_stream(hub, pushed):
     stream = StreamingSequenceDataset.from_hub(REPO, "1d", window=8)
     hub.faults = [Fault("status", SHARD, "GET", times=1000, status=503)]

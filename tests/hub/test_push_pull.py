@@ -119,6 +119,7 @@ def test_a_smaller_version_leaves_nothing_behind_and_spares_what_is_not_ours(hub
     assert pull(REPO, tmp_path / "got").complete
 
 
+@pytest.mark.slow
 def test_branches_tags_and_commits(hub, template, tmp_path):
     first = push(template, REPO, license="mit")
     second = push(template, REPO, license="mit", revision="v2", private=True)
@@ -145,6 +146,7 @@ def test_a_private_repository(hub, template, tmp_path, monkeypatch):
 # ---- parts ----
 
 
+@pytest.mark.slow
 def test_parts_add_up(hub, pushed, template, tmp_path):
     root = tmp_path / "got"
     part = pull(REPO, root, shards=[1])
@@ -311,6 +313,7 @@ def test_one_wrong_file_is_fetched_again(hub, pushed, template, tmp_path, times)
     check_whole(pull(REPO, tmp_path / "got").root, template)
 
 
+@pytest.mark.slow
 def test_a_file_that_stays_wrong_never_counts(hub, pushed, template, tmp_path):
     root = tmp_path / "got"
     shard = Manifest.read(template).shards[1]
@@ -351,12 +354,14 @@ def test_a_server_that_stays_busy(hub, pushed, tmp_path):
         pull(REPO, tmp_path / "got")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", few([r"/api/datasets", r"/tree/", r"/resolve/", LARGE], 1))
 def test_a_server_that_stalls_once(hub, pushed, template, tmp_path, path):
     hub.faults = [Fault("stall", path, times=1, seconds=5)]
     check_whole(pull(REPO, tmp_path / "got").root, template)
 
 
+@pytest.mark.slow
 def test_a_server_that_stalls_for_good(hub, pushed, tmp_path, monkeypatch):
     for name in ("HF_HUB_DOWNLOAD_TIMEOUT", "HF_HUB_ETAG_TIMEOUT"):
         monkeypatch.setattr(constants, name, 0.05)
@@ -423,6 +428,7 @@ def replace_manifest(hub, change):
     hub.repo(REPO).commit("main", {**files, "manifest.json": json_bytes(values)})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words"),
     few(
@@ -496,6 +502,7 @@ def test_a_server_that_sends_without_end(hub, pushed, tmp_path, monkeypatch):
 # ---- failures on the way up ----
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault",
     few(

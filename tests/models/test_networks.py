@@ -91,6 +91,7 @@ def test_wrong_shapes_and_settings_are_refused():
         checkpoint.make("vae", {"zsize": 3})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lidar", ["rings", "1d"])
 def test_the_frozen_encoder_gives_mu_in_every_way_it_may_run(lidar):
     torch.manual_seed(3)

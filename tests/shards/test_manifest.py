@@ -165,6 +165,7 @@ def test_shards_may_come_in_any_order_with_gaps_until_complete(dataset):
         manifest.with_shards([*manifest.shards, manifest.shards[0]], complete=True)
 
 
+@pytest.mark.slow
 def test_second_writer_is_refused_and_a_killed_one_is_not(dataset):
     code = (
         "import sys, time\nfrom navrep_data.shards import writer_lock\n"
@@ -212,6 +213,7 @@ def test_folder_reads_and_indexes(dataset):
     assert [worlds.episode(k).row for k in range(len(worlds))] == [r[3] for r in expected if r[2] == 1]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs /proc")
 def test_open_files_are_bounded(tmp_path):
     make_dataset(tmp_path, 12, 1, 20)

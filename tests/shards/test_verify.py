@@ -102,6 +102,7 @@ def set_at(name, index, value):
     return lambda c: c[name].__setitem__(index, value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "match"),
     [

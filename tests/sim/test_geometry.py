@@ -40,6 +40,7 @@ def test_solid_is_inside_boxes_or_outside_the_border(scene):
     assert 0.2 < got.mean() < 0.8
 
 
+@pytest.mark.slow
 def test_swept_clearance_is_the_smallest_distance_on_the_way(scene):
     boxes, border, edges, start = scene
     rng = np.random.default_rng(1)

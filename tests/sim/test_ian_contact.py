@@ -39,6 +39,7 @@ def oracle(solid: np.ndarray, resolution: float, x0: float, y0: float, a: np.nda
     return best
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.15])
 def test_swept_distance_equals_dense_sampling(share: float) -> None:
     rng = np.random.default_rng(3)

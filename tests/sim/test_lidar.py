@@ -109,6 +109,7 @@ def test_sensor_collinear_with_an_edge(heading, offset):
     assert scan.max() < math.hypot(11, 11) + 1e-6, "no ray leaves the border"
 
 
+@pytest.mark.slow
 def test_no_ray_slips_between_edges_that_share_a_corner():
     # A closed room whose corners lie on the bearings of rays, as exactly as float64 can say, from many
     # places.
@@ -131,6 +132,7 @@ def test_no_ray_slips_between_edges_that_share_a_corner():
             assert wrong.size == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [1e-4, 1e-6, 0.9e-6, 3e-8, 1e-9, 1e-11, 1e-14, 0.0])
 def test_corners_with_very_short_edges(length):
     # A star-shaped room with clusters of corners next to some rays and the seam: closer than the error of the

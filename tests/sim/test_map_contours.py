@@ -64,6 +64,7 @@ def test_exact_outlines_enclose_the_solid_cells(seed):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [0.3, 0.5, 1.0, 2.5])
 def test_simplified_outlines_stay_within_the_tolerance(tolerance):
     for seed in range(1 if PURE_PYTHON else 4):

@@ -106,6 +106,7 @@ def test_all_of_the_papers_maps_are_there(paper_maps):
     assert paper_maps == sorted(TABLE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(TABLE))
 def test_the_papers_maps_are_read_as_the_original_reads_them(name, paper_maps):
     columns, rows, resolution, origin, free_threshold, solid, free = TABLE[name]

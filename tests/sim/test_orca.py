@@ -188,6 +188,7 @@ def test_random_scenes_equal_rvo2(spread):
         assert_same(ours(s), want)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", ADVERSARIAL, ids=lambda f: f.__name__)
 def test_adversarial_scenes_equal_rvo2(make):
     rng = np.random.default_rng(7)
@@ -220,6 +221,7 @@ def test_other_settings_equal_rvo2(settings):
         assert_same(ours(s, settings), rvo2(s, settings)[0])
 
 
+@pytest.mark.slow
 def test_rollouts_equal_rvo2():
     rng = np.random.default_rng(5)
     for _ in range(10 if JIT else 1):
@@ -286,6 +288,7 @@ def test_a_speck_of_an_edge_hides_what_sticks_out_behind_it(x):
     assert counts[0] == 0 < counts[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kinds", [3, 8, 1000])
 def test_linear_programs_equal_the_slow_ones(kinds):
     """Lines of few directions: parallel ones of both senses, infeasible programs, failures among obstacle lines."""
@@ -315,6 +318,7 @@ def test_linear_programs_equal_the_slow_ones(kinds):
     assert fails == {True, False}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [scene, *ADVERSARIAL], ids=lambda f: f.__name__)
 def test_equal_to_the_slow_implementation(make):
     rng = np.random.default_rng(13)

@@ -154,6 +154,7 @@ def test_humans_do_not_know_the_border_and_the_robot_does():
     assert (sim.arrays.scalars[:, lay.S_BORDER] == 1).all()
 
 
+@pytest.mark.slow
 def test_start_headings_are_as_uneven_as_the_originals():
     """Of the 10 rad about pi/2, those that are met twice round the circle come twice as often."""
     n = 40 if numba.config.DISABLE_JIT else 2000
@@ -209,6 +210,7 @@ def test_episodes_are_numbered_as_in_the_original():
         numpy_seed("navrep-tset", 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("physics", ["consistent", "original"])
 @pytest.mark.parametrize("env", environment_names())
 def test_every_environment_runs_in_both_physics(env, physics):

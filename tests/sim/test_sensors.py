@@ -76,6 +76,7 @@ def scan_of(ellipses, polygons, pose, sensor):
     return out, owner, hits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS)
 def test_ellipses_match_the_quadratic_formula(name):
     rng = np.random.default_rng(4)

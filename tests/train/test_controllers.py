@@ -44,6 +44,7 @@ def test_selection_never_looks_at_the_test_suite():
     assert (AUTHORS_SEEDS.start, AUTHORS_SEEDS.stop) == (1000, 1100)  # their own selection, by --original only
 
 
+@pytest.mark.slow
 def test_worlds_are_the_simulators_with_their_codes():
     model = world_model()
     policy = Policy(Controller(ControllerConfig(21)), "z", "1d", None, model)
@@ -114,6 +115,7 @@ def test_a_few_steps_leave_a_policy_that_loads_and_drives(features, few_episodes
     assert "5000" in metadata["selected_on"]
 
 
+@pytest.mark.slow
 def test_ppo_moves_actor_critic_and_width_and_nothing_of_the_encoder(few_episodes, tmp_path):
     model = world_model()
     before = {name: p.clone() for name, p in model.named_parameters()}
@@ -128,6 +130,7 @@ def test_ppo_moves_actor_critic_and_width_and_nothing_of_the_encoder(few_episode
     assert all(torch.equal(p, before[name]) for name, p in model.named_parameters())
 
 
+@pytest.mark.slow
 def test_resume_goes_on_and_refuses_other_settings(few_episodes, tmp_path):
     model, out = world_model(), tmp_path / "c"
     recipe = default_controller_recipe("z", "1d").replace(**SMALL)
@@ -142,6 +145,7 @@ def test_resume_goes_on_and_refuses_other_settings(few_episodes, tmp_path):
     assert [r["step"] for r in read_log(out) if "val_success" in r] == ["64", "128"]
 
 
+@pytest.mark.slow
 def test_the_authors_settings_run_and_report_the_episodes_they_did_not_select_on(few_episodes, tmp_path):
     recipe = original_controller_recipe("z", "1d")
     assert (recipe.worlds, recipe.rollout, recipe.batch, recipe.entropy, recipe.steps) == (
@@ -164,6 +168,7 @@ def test_end_to_end(few_episodes, tmp_path):
     assert policy.act(*Simulator(environment(recipe), 3, seed=1).observe()).shape == (3, 3)
 
 
+@pytest.mark.slow
 def test_a_network_is_continued(few_episodes, tmp_path):
     model = world_model()
     torch.manual_seed(5)
@@ -227,6 +232,7 @@ def test_memory_that_is_fed_the_action_taken_lags_by_one_row():
     np.testing.assert_allclose(found[4][1], second[0, 0].numpy(), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_play_counts_each_episode_once():
     model = world_model()
     torch.manual_seed(0)

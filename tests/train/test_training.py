@@ -89,6 +89,7 @@ def test_losses_fall_with_rings(model, original, dataset, tmp_path):
     assert np.mean(done.losses[-3:]) < np.mean(done.losses[:2])
 
 
+@pytest.mark.slow
 def test_m_learns_from_codes_and_joins_its_v(latents, tmp_path):
     vae, codes = latents
     done = train_world_model(recipe("m", "1d", steps=15, window=16, stride=16), codes, tmp_path / "m")
@@ -101,6 +102,7 @@ def test_m_learns_from_codes_and_joins_its_v(latents, tmp_path):
     one_line(error)
 
 
+@pytest.mark.slow
 def test_the_authors_m_carries_its_state(latents, tmp_path):
     _, codes = latents
     settings = original_recipe("m", "1d").replace(window=60, stride=60, batch=2, micro_batch=2, steps=2)
@@ -113,6 +115,7 @@ def test_the_authors_m_carries_its_state(latents, tmp_path):
 # --- resume ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["v", "joint", "transformer", "m"])
 def test_resume_gives_the_same_losses_and_weights(model, dataset, latents, tmp_path):
     data = latents[1] if model == "m" else dataset
@@ -128,6 +131,7 @@ def test_resume_gives_the_same_losses_and_weights(model, dataset, latents, tmp_p
     assert steps == ["2", "3", "4", "6"]  # the stop validates too; no row comes twice
 
 
+@pytest.mark.slow
 def test_a_resume_with_other_settings_or_data_is_refused(dataset, tmp_path):
     out = tmp_path / "out"
     settings = recipe("v", "1d", steps=2)
@@ -146,6 +150,7 @@ def test_a_resume_with_other_settings_or_data_is_refused(dataset, tmp_path):
         train(settings, dataset, out, resume=True)
 
 
+@pytest.mark.slow
 def test_a_killed_save_leaves_the_checkpoint_before(dataset, tmp_path, monkeypatch):
     out = tmp_path / "out"
     settings = recipe("v", "1d", steps=4)
@@ -167,6 +172,7 @@ def test_a_killed_save_leaves_the_checkpoint_before(dataset, tmp_path, monkeypat
 # --- bad input ---
 
 
+@pytest.mark.slow
 def test_nan_in_the_loss_stops_and_keeps_the_last_good_checkpoint(dataset, tmp_path, monkeypatch):
     out = tmp_path / "out"
     settings = recipe("transformer", "1d", steps=6, save_every=2)
@@ -236,6 +242,7 @@ def test_shipped_recipes_are_recipes():
         assert all(line.startswith("navrep-data ") for line in entry["commands"]), name
 
 
+@pytest.mark.slow
 def test_shipped_commands_give_the_shipped_settings(tmp_path, monkeypatch):
     """What a recipe's last command line asks for is what the recipe says."""
     from navrep_data.cli import main

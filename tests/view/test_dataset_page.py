@@ -94,6 +94,7 @@ def test_the_legs_are_where_rays_end(dataset):
     assert np.mean(np.array(near) < 0.04) > 0.9  # a leg has a radius of 0.03 m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_bytes", [100_000, 150_000, 250_000])
 def test_the_size_is_bounded_and_the_page_says_what_was_left_out(dataset, max_bytes):
     page = dataset_page(dataset, [0, 1, 3], max_bytes=max_bytes)
@@ -215,6 +216,7 @@ def test_only_our_own_pages_are_replaced(dataset, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["page.html", "thesis.html"]
 
 
+@pytest.mark.slow
 def test_view_never_imports_torch():
     heavy = "{'torch', 'stable_baselines3', 'huggingface_hub'}"
     code = f"import sys, navrep_data.view; print(sorted({heavy} & set(sys.modules)))"

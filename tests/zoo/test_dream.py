@@ -35,6 +35,7 @@ def make(kind):
     return checkpoint.make(kind, SMALL[kind])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(SMALL))
 def test_dreams_are_seeded_and_keep_to_their_spaces(kind, dataset):
     env = gymnasium.make("navrep_data.zoo.dream:NavRepDream-v0", model=make(kind), data=dataset, temperature=0.5)
@@ -95,6 +96,7 @@ def test_reaching_the_goal_ends_the_dream_and_time_cuts_it(dataset):
     assert not any(any(end) for end in ends[:-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["transformer", "joint"])
 def test_pictures(kind, dataset):
     env = DreamEnv(make(kind), dataset, render_mode="rgb_array")
