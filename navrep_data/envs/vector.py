@@ -205,9 +205,8 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         }  # fmt: skip
         if self._worlds.numbered:
             infos |= {"seed": np.where(mask, self._worlds.seeds, 0), "_seed": mask.copy()}
-        names = self._worlds.scenarios()
-        if names:
-            scenarios = np.array(names, object)
+        scenarios = self._worlds.scenarios()
+        if len(scenarios):
             scenarios[~mask] = None
             infos |= {"scenario": scenarios, "_scenario": mask.copy()}
         if rewards is not None and stepped is not None and stepped.any():

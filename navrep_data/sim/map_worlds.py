@@ -196,6 +196,11 @@ class MapWorlds:
         """Return which of the config's maps a world is on."""
         return int(self.arrays.worlds.place[world, il.M_MAP])
 
+    def scenarios_played(self) -> NDArray[np.int64]:
+        """Return the index of the scenario that each world plays, (W,); -1 where start and goal are random."""
+        played: NDArray[np.int64] = self.arrays.worlds.place[:, il.M_SCENARIO].astype(np.int64)
+        return played
+
     def scenario_name(self, world: int) -> str:
         """Return the scenario that a world plays, '' where start and goal are random."""
         index = int(self.arrays.worlds.place[world, il.M_SCENARIO])
