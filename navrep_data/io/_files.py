@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import math
 import os
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -105,6 +106,14 @@ def atomic_write_json(path: Path | str, value: Any) -> None:
     atomic_write_bytes(path, json_bytes(value))
 
 
+def _finite(text: str) -> float:
+    """Return the number that `text` is; Python's parser would let NaN, Infinity and 1e999 through."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is not a finite number")
+    return value
+
+
 def read_json(path: Path | str, max_bytes: int = MAX_JSON_BYTES) -> Any:
     """Read a JSON file that may come from anywhere.
 
@@ -120,14 +129,14 @@ def read_json(path: Path | str, max_bytes: int = MAX_JSON_BYTES) -> Any:
     DatasetError
         If the file is too large.
     CorruptDataError
-        If it is not valid JSON.
+        If it is not valid JSON, NaN and infinite numbers included.
     """
     path = Path(path)
     size = path.stat().st_size
     if size > max_bytes:
         raise DatasetError(f"{path} has {size:,} bytes, expected at most {max_bytes:,}: not a file of this package.")
     try:
-        return json.loads(path.read_bytes())
+        return json.loads(path.read_bytes(), parse_float=_finite, parse_constant=_finite)
     except (ValueError, RecursionError) as error:
         raise CorruptDataError(
             f"{path} is not valid JSON ({error}). Expected a file written by navrep-data; get it again."

@@ -77,3 +77,10 @@ def test_cache_folder_follows_the_variable(monkeypatch, tmp_path):
     assert not (tmp_path / "x").exists()
     monkeypatch.delenv("NAVREP_DATA_HOME")
     assert io.cache_dir().name == "navrep-data"
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
+def test_json_with_numbers_that_are_none_is_refused(tmp_path, number):
+    (tmp_path / "x.json").write_text(f'{{"a": [1.5, {number}]}}')
+    with pytest.raises(CorruptDataError, match=f"not valid JSON.*{number} is not a finite number"):
+        io.read_json(tmp_path / "x.json")
