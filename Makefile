@@ -4,6 +4,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO ?= data/demo
+# test processes; 0 = all tests in one
+JOBS ?= auto
 
 .PHONY: help install demo test check format bench bench-peers test-nojit test-boundscheck coverage kill-test wheel clean
 
@@ -24,7 +26,7 @@ demo: $(STAMP)  ## Generate a small dataset, print its summary, load windows thr
 	$(BIN)/python examples/load_windows.py $(DEMO)
 
 test: $(STAMP)  ## Run the whole test suite, slow tests included.
-	$(BIN)/python -m pytest -m "slow or not slow" $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m "slow or not slow" --numprocesses $(JOBS) --dist loadfile $(PYTEST_ARGS)
 
 check: $(STAMP)  ## Format, lint, types, import contracts.
 	$(BIN)/ruff format --check .
