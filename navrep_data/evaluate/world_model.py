@@ -283,6 +283,10 @@ def _dreams(model: WorldModel, batch: dict[str, Tensor], context: int, steps: in
         sums.dream["still_goal"][k] += float(_row_errors(last_goal[there, k], real_goal[there, k]).sum())
 
 
+# Longer labels would leave the axes of a figure no room.
+LABEL_LENGTH = 28
+
+
 def table(results: list[WorldModelError]) -> list[str]:
     """Return lines for people: one model per line, errors of lidar and goal apart."""
     width = max([len(r.name) for r in results] + [5])
@@ -301,6 +305,11 @@ def table(results: list[WorldModelError]) -> list[str]:
     return lines
 
 
+def _short(name: str) -> str:
+    """Return a name, perhaps a path, that fits under a bar."""
+    return name if len(name) <= LABEL_LENGTH else f"...{name[3 - LABEL_LENGTH :]}"
+
+
 def figure(results: list[WorldModelError], path: Path | str) -> None:
     """Draw the errors of the next step as bars and those of the dream as curves, lidar and goal apart."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -313,7 +322,7 @@ def figure(results: list[WorldModelError], path: Path | str) -> None:
     units = {"rings": "MSE of rings", "1d": "MSE of ranges / 25 m"}
     what = units[results[0].lidar] if len({r.lidar for r in results}) == 1 else "MSE"
     for j, (kind, label) in enumerate((("scan", what), ("goal", "MSE of the goal [m$^2$]"))):
-        names = [r.name for r in results]
+        names = [_short(r.name) for r in results]
         bars, curves = axes[0, j], axes[1, j]
         bars.bar(names, [getattr(r, f"{kind}_mse") for r in results], color="#1f4e79", label="model")
         still = [getattr(r, f"still_{kind}_mse") for r in results]
@@ -324,7 +333,7 @@ def figure(results: list[WorldModelError], path: Path | str) -> None:
         bars.legend(fontsize=7)
         for r in results:
             values = getattr(r, f"dream_{kind}_mse")
-            curves.plot(range(1, len(values) + 1), values, marker=".", label=r.name)
+            curves.plot(range(1, len(values) + 1), values, marker=".", label=_short(r.name))
         first = getattr(results[0], f"dream_still_{kind}_mse")
         curves.plot(range(1, len(first) + 1), first, "--", color="#888888", label="standing still")
         curves.set_xlabel("steps dreamed (0.2 s each)")

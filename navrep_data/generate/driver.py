@@ -30,7 +30,7 @@ from navrep_data.generate.plan import (
 )
 from navrep_data.generate.policy import load_callable, make_policy
 from navrep_data.generate.worker import STAGING, ShardTask, seconds_per_row
-from navrep_data.io import PART_SUFFIX, sha256_file
+from navrep_data.io import PART_SUFFIX, sha256_file, translate_os_error
 from navrep_data.shards import (
     MANIFEST_FILE,
     Manifest,
@@ -188,7 +188,10 @@ def generate(
     request = replace(
         request, command=_command(request, env, physics, humans, obstacles, legs, maps, shard_size, scan_dtype)
     )
-    existed = root.exists()
+    try:
+        existed = root.exists()
+    except OSError as error:
+        raise translate_os_error(error, root) from error
     try:
         check_folder(root)
         with writer_lock(root):
