@@ -41,13 +41,13 @@ format: $(STAMP)  ## Format and fix what can be fixed.
 KERNEL_TESTS := tests/sim tests/observations
 
 test-nojit: $(STAMP)  ## Run the kernel tests as plain Python.
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) $(PYTEST_ARGS)
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) --numprocesses $(JOBS) $(PYTEST_ARGS)
 
 test-boundscheck: $(STAMP)  ## Run the kernel tests with every array index checked.
-	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNEL_TESTS) $(PYTEST_ARGS)
+	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNEL_TESTS) --numprocesses $(JOBS) $(PYTEST_ARGS)
 
 coverage: $(STAMP)  ## Line coverage of sim and observations, measured on plain Python.
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) --cov=navrep_data.sim --cov=navrep_data.observations \
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) --numprocesses $(JOBS) --cov=navrep_data.sim --cov=navrep_data.observations \
 	  --cov-report=term --cov-fail-under=95 $(PYTEST_ARGS)
 
 kill-test: $(STAMP)  ## 200 random SIGKILLs of generate (CI runs 10).
