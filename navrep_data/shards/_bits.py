@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic, overload
 
 WORD_BITS = 64
@@ -27,8 +27,8 @@ def _instruction(name):
     @intrinsic
     def count(typing_context, word):
         def generate(context, builder, signature, arguments):
-            zero_is_defined = ir.Constant(ir.IntType(1), 0)
-            return getattr(builder, name)(arguments[0], zero_is_defined)
+            # false: zero is no undefined input, it gives all bits
+            return getattr(builder, name)(arguments[0], cgutils.false_bit)
 
         return types.int64(types.uint64), generate
 
