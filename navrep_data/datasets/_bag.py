@@ -82,7 +82,7 @@ class Tracks:
 
 
 class Bag:
-    """An open bag: a ROS 1 file or the folder of a ROS 2 bag.
+    """An open bag: a ROS 1 file, or a ROS 2 bag (its folder, or one .mcap or .db3 file).
 
     Parameters
     ----------
@@ -126,8 +126,6 @@ class Bag:
             raise MissingExtraError("rosbags is not installed; get it: pip install 'navrep-data[ros]'") from None
         if not self.path.exists():
             raise DatasetNotFoundError(f"There is no {self.path}; expected a ROS 1 .bag or the folder of a ROS 2 bag.")
-        if self.path.is_file() and self.path.suffix != ".bag":
-            raise ConfigError(f"{self.path} is a file; expected a ROS 1 .bag, or of a ROS 2 bag its folder.")
         with self._explained():
             # bags of older ROS 2 do not say what their messages look like; those used here never changed
             store = types.get_typestore(types.Stores.ROS2_HUMBLE)

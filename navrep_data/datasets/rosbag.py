@@ -93,8 +93,8 @@ def import_rosbag(
         Topics of ``sensor_msgs/LaserScan`` and ``nav_msgs/Odometry``; needed where a bag has several (of scans,
         ``/combined_scan`` is taken by itself).
     goal_topic : str, optional
-        Topic of ``geometry_msgs/PoseStamped``; by default the one with "goal" in its name, if any. ``"none"``: goals are
-        unknown.
+        Topic of ``geometry_msgs/PoseStamped``; by default the one with "goal" in its name, if any. ``"none"``: goals
+        are unknown.
     env : str
         Name of the environment, for the manifest.
     dt : float

@@ -77,7 +77,7 @@ class Manifest:
     partial : dict or None
         In a copy that holds some shards only: what the whole has, see :data:`PARTIAL_FIELDS`.
     source : tuple of dict
-        Records of the datasets that this one was made out of, if it was: see :mod:`navrep_data.shards.source`.
+        Records of the datasets that this one was made out of, if it was: see ``navrep_data/shards/source.py``.
     format_version : int
         Version of the format.
     """

@@ -24,6 +24,8 @@ from navrep_data.schema import ACTION_SIZE, N_RAYS, ROBOT_STATE_SIZE, Event
 
 Arrays = dict[str, npt.NDArray[Any]]
 FORMATS = ("npz", "minari")
+MIN_DIGITS = 3
+"""Digits of the number in the name of an npz file; more where there are more sequences."""
 # What Minari calls a dataset: (namespace/)name-vN; also a relative path, so nothing that could lead elsewhere.
 _MINARI_ID = re.compile(r"([A-Za-z0-9][\w-]*/)*[A-Za-z0-9][\w-]*-v\d{1,6}")
 _INFOS = ("event", "sequence", "robot_pose", "robot_radius", "humans")
@@ -171,7 +173,7 @@ def _npz_files(part: Path, given: Given, progress: Progress | None) -> dict[str,
         )
     pieces = given.pieces()
     # files are imported in the order of their names
-    digits = max(3, len(str(pieces[-1].source.sequence)), len(str(len(pieces))))
+    digits = max(MIN_DIGITS, len(str(given.manifest.shards[-1].sequences[1] - 1)))
     for k, piece in enumerate(pieces):
         columns = _columns(piece)
         buffer = io.BytesIO()
