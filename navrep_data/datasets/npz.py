@@ -159,7 +159,8 @@ def unplayed_frames(dones: npt.NDArray[Any], actions: npt.NDArray[Any], rewards:
     dones, actions, rewards : ndarray of shape (N,), (N, 3), (N,)
         As the original stores them.
     """
-    return dones & (actions == 0).all(1) & (rewards == 0)
+    unplayed: npt.NDArray[np.bool_] = dones & (actions == 0).all(1) & (rewards == 0)
+    return unplayed
 
 
 def align(arrays: Arrays, sequence: int, timeout_rows: int | None = TIMEOUT_ROWS) -> Arrays:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -12,7 +13,9 @@ from navrep_data.io._files import PART_SUFFIX, fsync_dir, translate_os_error
 
 
 @contextlib.contextmanager
-def new_folder(out: Path | str, *, what: str = "this", apart_from: Iterable[Path | str] = ()) -> Iterator[Path]:
+def new_folder(
+    out: str | os.PathLike[str], *, what: str = "this", apart_from: Iterable[str | os.PathLike[str]] = ()
+) -> Iterator[Path]:
     """Make a folder beside `out`, to be filled inside the ``with``; afterwards it is renamed to `out`.
 
     Parameters

@@ -168,6 +168,8 @@ def _sources(m: Manifest) -> str:
 
 def _limits(m: Manifest) -> str:
     lines = ["* Simulated: flat ground, a planar lidar without noise, humans that follow ORCA."]
+    if m.physics == "recorded":
+        lines = ["* Recorded with a robot: people, poses of obstacles and the robot's radius are not known."]
     if m.scan_dtype == "uint16":
         lines.append(
             "* Scans are rounded to millimetres: about 1 frame in 8 has one rings cell one bin off that of float32."

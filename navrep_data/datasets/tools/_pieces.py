@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import os
 import platform
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -118,7 +119,7 @@ class Given:
         If there is no dataset that can be read.
     """
 
-    def __init__(self, root: Path | str) -> None:
+    def __init__(self, root: str | os.PathLike[str]) -> None:
         self.root = Path(root)
         self.folder = DatasetFolder(self.root)
         self.manifest = self.folder.manifest
@@ -258,7 +259,7 @@ def write_dataset(
     manifest = _plan(given, pieces, tuple(records.values()), command)
     # position of each record in the new manifest, by its hash
     number = {content: k for k, content in enumerate(records)}
-    entries = []
+    entries: list[ShardEntry] = []
     for first in range(0, len(pieces), manifest.shard_size):
         mine = pieces[first : first + manifest.shard_size]
         writer = ShardWriter(
@@ -289,8 +290,11 @@ def _joined_records(given: Iterable[Given]) -> dict[str, dict[str, Any]]:
 
 
 def _followed_rule(given: Sequence[Given]) -> str:
-    rules = {one.manifest.split_rule.removeprefix(f"{FOLLOWED_RULE} (").removesuffix(")") for one in given}
-    return f"{FOLLOWED_RULE} ({rules.pop()})" if len(rules) == 1 else FOLLOWED_RULE
+    """Return the rule in words; what already follows a rule is not told twice."""
+    before = f"{FOLLOWED_RULE} ("
+    rules = {one.manifest.split_rule for one in given}
+    rules = {rule[len(before) : -1] if rule.startswith(before) else rule for rule in rules}
+    return f"{before}{rules.pop()})" if len(rules) == 1 else FOLLOWED_RULE
 
 
 def _plan(
@@ -303,7 +307,6 @@ def _plan(
     length, max_humans = max(o.length for o in all_m), max(o.max_humans for o in all_m)
     return replace(
         m,
-        seed=m.seed,
         length=length,
         max_humans=max_humans,
         planned=len(pieces),
@@ -323,11 +326,9 @@ def _shard_size(m: Manifest, rows: Sequence[int], max_humans: int) -> int:
     def largest(size: int) -> int:
         return max(sum(rows[k : k + size]) for k in range(0, len(rows), size))
 
-    per_row = estimate_bytes(
-        m.columns, 1_000, n_rays=m.sensor.n_rays, scan_dtype=m.scan_dtype, max_humans=max_humans
-    ) / 1_000  # fmt: skip
+    width: dict[str, Any] = {"n_rays": m.sensor.n_rays, "scan_dtype": m.scan_dtype, "max_humans": max_humans}
     size = max(1, TARGET_SHARD_ROWS * len(rows) // sum(rows))
-    while size > 1 and largest(size) * per_row > MAX_SHARD_BYTES:
+    while size > 1 and estimate_bytes(m.columns, largest(size), **width) > MAX_SHARD_BYTES:
         size //= 2
     return size
 

@@ -58,7 +58,7 @@ def sample(
     """
     if not 1 <= n <= MAX_PICTURES:
         raise ConfigError(f"{n} pictures were asked for; expected 1 to {MAX_PICTURES:,}.")
-    with DatasetFolder(root) as folder:
+    with DatasetFolder(Path(root)) as folder:
         e = folder.episodes
         chosen = e.in_split(split)
         if not len(chosen):
