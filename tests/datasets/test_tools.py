@@ -148,7 +148,7 @@ def test_merge(few, many, tmp_path):
 
 def drawn(page):
     """The data embedded in a page."""
-    found = re.findall(r"[A-Za-z0-9+/=]{2000,}", page.html)
+    found = re.findall(rb"[A-Za-z0-9+/=]{2000,}", page.html)
     assert found
     return found
 
@@ -523,16 +523,16 @@ def test_stats(few):
 
 
 def test_sample(few, tmp_path):
-    paths = sample(few, tmp_path / "a", n=3, seed=5)
-    assert len(paths) == len(set(paths)) == 3
+    paths = sample(few, tmp_path / "a", n=2, seed=5)
+    assert len(paths) == len(set(paths)) == 2
     for path in paths:
         with Image.open(path) as image:
             assert image.size == (1100, 600)
             assert len(np.unique(np.asarray(image))) > 20
-    again = sample(few, tmp_path / "b", n=3, seed=5)
+    again = sample(few, tmp_path / "b", n=2, seed=5)
     assert [p.name for p in again] == [p.name for p in paths]
     assert [p.read_bytes() for p in again] == [p.read_bytes() for p in paths]
-    other = sample(few, tmp_path / "c", n=2, seed=6, split="val")
+    other = sample(few, tmp_path / "c", n=1, seed=6, split="val")
     assert {p.name[:14] for p in other} == {"sequence-00001"}
     with pytest.raises(ConfigError, match="0 pictures were asked for"):
         sample(few, tmp_path / "d", n=0)
