@@ -138,8 +138,8 @@ def test_a_map_too_small_for_a_goal_is_refused(tmp_path: Path) -> None:
         ),
         (
             1,
-            (-0.8, 1.0),
-            r"the start \(-0.8, 1\) on map 'hall' is 0.20 m from the nearest wall .*at least 0.3 m: move it",
+            (-0.75, 1.0),
+            r"\(-0.75, 1\) is 0.20 m from the nearest wall on map 'hall', expected at least 0.3 m of free",
         ),
         (1, (40.0, 1.0), r"the start \(40, 1\) is outside map 'hall', expected at least"),
         (2, (12.0, 1.0), r"the goal \(12, 1\) on map 'hall' is out of reach from \(2, 1\)"),
