@@ -75,7 +75,7 @@ class Manifest:
     extras : tuple of FileEntry
         What a published dataset has besides: pictures for its card, an index of its episodes.
     partial : dict or None
-        In a copy that holds some shards only: what the whole has, see :data:`PARTIAL_FIELDS`.
+        In a copy that holds some shards only: what the whole has: hash of its manifest, shards, sequences, rows.
     source : tuple of dict
         Records of the datasets that this one was made out of, if it was: see ``navrep_data/shards/source.py``.
     format_version : int
