@@ -193,9 +193,11 @@ def _sources(m: Manifest) -> str:
 
 
 def _limits(m: Manifest) -> str:
-    noise = "with noise" if m.config.get("scan_noise") or m.config.get("scan_dropout") else "without noise"
-    walk = _HUMANS.get(str(m.config.get("human_policy", "orca")), "humans that follow a script")
-    lines = [f"* Simulated: flat ground, a planar lidar {noise}, {walk}."]
+    # of several datasets made into one, `config` has what they share; what differs is with each
+    configs = [c if isinstance(c := record.get("config"), dict) else m.config for record in m.source] or [m.config]
+    noise = "with noise" if any(c.get("scan_noise") or c.get("scan_dropout") for c in configs) else "without noise"
+    walks = [_HUMANS.get(str(c.get("human_policy", "orca")), "humans that follow a script") for c in configs]
+    lines = [f"* Simulated: flat ground, a planar lidar {noise}, {' or '.join(dict.fromkeys(walks))}."]
     if m.physics == "recorded":
         lines = ["* Recorded with a robot: people, obstacles and the robot's radius are not known."]
     if m.scan_dtype == "uint16":
