@@ -23,7 +23,7 @@ def high_zeros(word: Any) -> int:
     return WORD_BITS - int(word).bit_length()
 
 
-def _instruction(name):
+def _instruction(name: str) -> Any:
     @intrinsic
     def count(typing_context, word):
         def generate(context, builder, signature, arguments):

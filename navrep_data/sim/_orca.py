@@ -120,7 +120,7 @@ def _put_line(x, y, dx, dy, n_lines, lines):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _edge_line(j, px, py, vx, vy, radius, inv_tau, n, obst_f, obst_i, lines):
-    """Add the constraint of edge `j` to the `n` lines, if it makes one; return the number of lines."""
+    """Add the constraint of edge `j`, which none covers, to the `n` lines, if it makes one; return their number."""
     o1 = j
     o2 = obst_i[OI_NEXT, j]
     r1x = obst_f[OF_X, o1] - px
