@@ -22,7 +22,7 @@ from navrep_data.io import cache_dir
 DISTRIBUTION = "navrep-data"
 Status = Literal["ok", "note", "problem"]
 
-PYTHONS = ((3, 11), (3, 14))
+PYTHONS = ((3, 11), (3, 13))
 """First Python that works, and the last one that the suite was run with."""
 KNOWN_GOOD: dict[str, str] = {
     "numpy": "<3",

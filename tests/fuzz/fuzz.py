@@ -3,8 +3,8 @@
 Each target (:mod:`fuzz_targets`) runs in a process of its own whose address space is bounded. Valid files are changed
 (:mod:`fuzz_edits`) as hypothesis chooses and read. Either the reader takes them, or it raises an error of
 :mod:`navrep_data.errors` on one line. Anything else is a finding: another exception, memory that ran out or grew by
-more than :data:`MEMORY`, a read that takes longer than :data:`HANG`, a process that dies, a file outside the folder.
-Exit code 1 if there is one; its files are kept.
+more than :data:`MEMORY`, a read that takes more than :data:`HANG` or :data:`STANDSTILL`, a process that dies, a file
+outside the folder. Exit code 1 if there is one; its files are kept.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import json
 import os
 import resource
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -37,7 +38,9 @@ MEMORY = 512 << 20
 ADDRESS_SPACE = 1 << 30
 """Bytes that may be asked for beyond what the process has when it starts."""
 HANG = 20.0
-"""Seconds that reading one small file may take at most, on a busy machine."""
+"""Seconds of the processor's time that reading one small file may take at most."""
+STANDSTILL = 600.0
+"""Seconds by the clock that it may take; long, since whole machines are stopped and go on."""
 _ROUND = 250
 _LONGEST_MESSAGE = 2000
 
@@ -77,7 +80,7 @@ class _Fuzzer:
         self.target, self.files, self.report = target, files, Report(target.name)
         self.case, self.outside = work / "case", work / Path(OUTSIDE).name
         self.outside.write_text("not to be touched")
-        self.around = sorted(p.name for p in work.iterdir()) + ["case"]
+        self.around = [*sorted(p.name for p in work.iterdir()), "case"]
         self._read(self.files)  # a target whose own files are refused would find nothing
         target.read(self.case)
 
@@ -123,7 +126,8 @@ class _Fuzzer:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
         before = _reset_peak()
-        faulthandler.dump_traceback_later(HANG, exit=True)
+        faulthandler.dump_traceback_later(STANDSTILL, exit=True)
+        signal.setitimer(signal.ITIMER_PROF, HANG)  # its signal ends the process, wherever it is
         try:
             self.target.read(self.case)
             taken = True
@@ -131,6 +135,7 @@ class _Fuzzer:
             _check_refusal(error)
             taken = False
         finally:
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
             faulthandler.cancel_dump_traceback_later()
         grown = _peak() - before
         if grown > MEMORY:
@@ -173,6 +178,8 @@ def _peak() -> int:
 def _child(target: Target, files: Files, work: Path, seconds: float, seed: int) -> None:
     """Fuzz one target and write its report; ends the process."""
     warnings.simplefilter("ignore")
+    faulthandler.enable()
+    faulthandler.register(signal.SIGPROF, chain=True)  # tells where it hangs before it ends
     os.environ["NAVREP_DATA_HOME"] = str(work / "home")
     os.environ["NAVREP_DATA_OFFLINE"] = "1"
     (work / "home").mkdir()

@@ -347,8 +347,10 @@ def edit_yaml(data: bytes, edit: Edit) -> bytes | None:
     return ("\n".join(lines) + "\n").encode("utf-8", "surrogatepass")
 
 
-_PGM_TOKENS = (b"0", b"1", b"-1", b"8192", b"8193", b"99999999999999999999", b"65535", b"65536", b"1000000000", b"x",
-               b"#c\n3", b"", b"255", b"256", b"P2", b"P6", b"P4", b"Pf", b"P7", b"P0CMYK", b"1e3", b"2147483647")  # fmt: skip
+_PGM_TOKENS = (
+    b"0", b"1", b"-1", b"8192", b"8193", b"99999999999999999999", b"65535", b"65536", b"1000000000", b"x", b"#c\n3",
+    b"", b"255", b"256", b"P2", b"P6", b"P4", b"Pf", b"P7", b"P0CMYK", b"1e3", b"2147483647",
+)  # fmt: skip
 
 
 def edit_pgm(data: bytes, edit: Edit) -> bytes:

@@ -11,7 +11,8 @@ import numpy as np
 
 ATTRIBUTES: tuple[Any, ...] = (
     0, 1, -1, 2, 12, 1 << 20, (1 << 31) - 1, 1 << 40, (1 << 62), -(1 << 62), 0.5, 1e308, np.nan, np.inf, -np.inf, 25.0,
-    "", "x" * 5000, "navrep-data", "{}", "[" * 3000, '{"a": NaN}', "\u20ac", np.arange(2), np.arange(-3, 0), np.zeros(0),
+    "", "x" * 5000, "navrep-data", "{}", "[" * 3000, '{"a": NaN}', "\u20ac", np.arange(2), np.arange(-3, 0),
+    np.zeros(0),
     np.array([0, 2**62]), np.array([2, 1]), np.array(["a", "b"], "S1"), True, np.complex64(1), np.float16(2),
     np.array([[1, 2]]), h5py.Empty("f4"), np.uint64(2**64 - 1),
 )  # fmt: skip
@@ -91,7 +92,8 @@ def _shape(file: Any, name: str, at: int, value: int) -> None:
 def _dtype(file: Any, name: str, at: int, value: int) -> None:
     kinds = (
         ">f4", "f8", "S5", "u8", "c8", h5py.string_dtype(), h5py.ref_dtype, h5py.vlen_dtype("f4"), "f2", "i1",
-        h5py.enum_dtype({"a": 1}), np.dtype([("a", "f4")]), np.dtype(("f4", (3,))), h5py.opaque_dtype(np.dtype("M8[s]")),
+        h5py.enum_dtype({"a": 1}), np.dtype([("a", "f4")]), np.dtype(("f4", (3,))),
+        h5py.opaque_dtype(np.dtype("M8[s]")),
     )  # fmt: skip
     _again(file, name, shape=file[name].shape, dtype=kinds[value % len(kinds)])
 

@@ -384,7 +384,7 @@ def _read_policy(folder: Path) -> None:
 
 def _drive(policy: Any) -> None:
     policy.reset(batch_size=1)
-    policy.act(np.full((1, policy.sensor.n_rays), 5.0, np.float32), np.zeros((1, 5), np.float32))
+    policy.act(np.full((1, 1080), 5.0, np.float32), np.zeros((1, 5), np.float32))
 
 
 def _make_latents(folder: Path) -> None:

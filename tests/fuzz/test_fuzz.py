@@ -37,14 +37,15 @@ try:
 except MemoryError as error:
     raise ConfigError('too large') from error
 """,
-    "hang": "import time; time.sleep(60)",
+    "hang": "while True: pass",
+    "standstill": "import time; time.sleep(60)",
     "death": "import os; os.abort()",
     "outside": "(folder / '../outside.txt').write_text('x')",
 }
 FOUND = {
     "crash": "KeyError: 'x'", "several lines": "or several lines", "memory": "reading took 6",
-    "memory ran out": "memory ran out before", "hang": "the process died", "death": "the process died",
-    "outside": "files outside the folder",
+    "memory ran out": "memory ran out before", "hang": "the process died", "standstill": "the process died",
+    "death": "the process died", "outside": "files outside the folder",
 }  # fmt: skip
 
 
@@ -57,7 +58,7 @@ import sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 import fuzz, fuzz_targets
 from pathlib import Path
-fuzz.HANG = 2.0
+fuzz.HANG, fuzz.STANDSTILL = 2.0, 6.0
 def read(folder):
     if (folder / 'a.json').read_bytes() == b'[1, 2, 3]':
         return
