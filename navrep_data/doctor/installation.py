@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from packaging.requirements import Requirement
 from packaging.version import Version
@@ -191,7 +191,8 @@ def _kernels() -> Iterator[Check]:
     from navrep_data._kernels import kernel_cache_folder
     from navrep_data.observations import scan_to_rings
 
-    if numba.config.DISABLE_JIT:
+    config: Any = numba.config  # untyped: its switches are set dynamically
+    if config.DISABLE_JIT:
         yield Check("kernels", "note", "NUMBA_DISABLE_JIT is set: all runs as plain Python, 100 times slower; unset it")
         return
     folder = kernel_cache_folder()
