@@ -52,7 +52,12 @@ def test_an_http_client_is_refused():
 
 def test_this_machine_answers(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
-        thread = threading.Thread(target=lambda: server.accept()[0].sendall(b"hello"))
+
+        def greet():
+            with server.accept()[0] as made:
+                made.sendall(b"hello")
+
+        thread = threading.Thread(target=greet)
         thread.start()
         with socket.create_connection(("localhost", server.getsockname()[1]), 5) as made:
             assert made.recv(5) == b"hello"

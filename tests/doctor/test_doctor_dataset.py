@@ -180,13 +180,13 @@ def test_a_reset_without_is_first(sound, tmp_path):
     """A robot that is somewhere else in the middle of an episode: its goal stays in place, so only motion tells."""
 
     def change(k, columns, worlds):
-        row = int(np.flatnonzero(columns["is_last"])[0]) // 2
+        first, last = np.flatnonzero(columns["is_first"]), np.flatnonzero(columns["is_last"])
+        longest = int((last - first).argmax())
+        row, stop = (first[longest] + last[longest]) // 2, last[longest] + 1
         columns["robot_pose"][row:, :2] += 3.0
-        for start in np.flatnonzero(columns["is_first"])[1:]:
-            place = int(np.flatnonzero(worlds["row"] == start)[0])
-            worlds["robot_start"][place, :2] += 3.0
-            worlds["robot_goal"][place] += 3.0
-        stop = int(np.flatnonzero(columns["is_last"])[0]) + 1
+        later = worlds["row"] >= stop
+        worlds["robot_start"][later, :2] += 3.0
+        worlds["robot_goal"][later] += 3.0
         theta = columns["robot_pose"][row:stop, 2]
         back = np.stack([np.cos(theta) + np.sin(theta), np.cos(theta) - np.sin(theta)], axis=1) * 3.0
         columns["robot_state"][row:stop, :2] -= back

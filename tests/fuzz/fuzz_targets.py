@@ -276,6 +276,7 @@ def _make_npz(folder: Path) -> None:
 def _read_npz(folder: Path) -> None:
     from navrep_data.datasets import import_npz
 
+    shutil.rmtree(folder / "out", ignore_errors=True)
     import_npz(folder, folder / "out", rings=False)
 
 
@@ -318,13 +319,14 @@ def _make_tf(folder: Path) -> None:
     from navrep_data.zoo.importers_tf import memory_variables
 
     shapes = [shape for _, shape in memory_variables()]
-    (folder / "memory.json").write_text(json.dumps([np.zeros(shape, int).tolist() for shape in shapes]))
+    # no ".json": changing three megabytes as a structure takes seconds; tests/zoo/test_import_hostile.py does that
+    (folder / "memory").write_text(json.dumps([np.zeros(shape, int).tolist() for shape in shapes]))
 
 
 def _read_tf(folder: Path) -> None:
     from navrep_data.zoo.importers import load_tf_json
 
-    load_tf_json(folder / "memory.json", None)
+    load_tf_json(folder / "memory", None)
 
 
 def _make_checkpoint(folder: Path) -> None:

@@ -25,7 +25,7 @@ from navrep_data.sim.maps import load_map
 BY_NAME = {target.name: target for target in TARGETS}
 
 
-def refused(read, error=NavrepDataError, match="", seconds=5.0, megabytes=64):
+def refused(read, error=NavrepDataError, match=None, seconds=5.0, megabytes=64):
     """`read` is refused on one short line, in little time and memory."""
     tracemalloc.start()
     start = time.process_time()
@@ -172,9 +172,9 @@ def test_npz_files_that_claim_or_unpack_too_much():
         (packed({"a.npy": bytes(64 << 20)}), "or more than 1,000,000 bytes unpacked"),
         (packed({"a.npy": b"x"}, zipfile.ZIP_LZMA), "stored or deflated"),
         (packed({"a.npy": b"x"}, zipfile.ZIP_BZIP2), "stored or deflated"),
-        (packed({"a.npy": npy("(" * 300)}), ""),
+        (packed({"a.npy": npy("(" * 300)}), None),
         (packed({f"{k}": b"" for k in range(1001)}), "1001 members"),
-        (b"PK", ""),
+        (b"PK", None),
     ):
         refused(lambda data=data: read_npz(data, 1_000_000), ValueError, words, megabytes=32)
 
@@ -212,20 +212,22 @@ def test_damaged_deflate_streams(name, tmp_path):
 
 
 def test_damaged_and_oddly_packed_controllers(tmp_path):
+    from navrep_data.zoo.importers import load_controller_zip
+
     target = BY_NAME["sb2-zip"]
     target.make(tmp_path)
     path = tmp_path / "model.zip"
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     path.write_bytes(packed(members))
-    target.read(tmp_path)
+    load_controller_zip(path)
     path.write_bytes(broken_stream(packed({"parameter_list": members.pop("parameter_list"), **members})))
-    refused(lambda: target.read(tmp_path), CheckpointError, "cannot be unpacked")
+    refused(lambda: load_controller_zip(path), CheckpointError, "cannot be unpacked")
     target.make(tmp_path)
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     path.write_bytes(packed(members, zipfile.ZIP_LZMA))
-    refused(lambda: target.read(tmp_path), CheckpointError, "expected stored or deflated")
+    refused(lambda: load_controller_zip(path), CheckpointError, "expected stored or deflated")
 
 
 @of("worlds")
@@ -358,13 +360,14 @@ def test_what_plain_h5py_writes_is_still_read(shard):
     expected["robot_state"] = noise
     again(shard, "scan", compression="gzip", chunks=(7, 100), shuffle=True, fletcher32=True)
     again(shard, "rings", compression="gzip", chunks=(5, 64, 9))
-    again(shard, "robot_state", data=noise, compression="gzip", chunks=(3, 5), fletcher32=True)
+    again(shard, "robot_state", data=noise, compression="gzip", chunks=(3, 5))
     again(shard, "reward", compression="lzf", fletcher32=True)
     again(shard, "step", fletcher32=True)
     again(shard, "is_first", chunks=(1,), compression="gzip")
+    with h5py.File(shard, "r+") as file:  # HDF5 leaves gzip out where it fails
+        file["robot_state"].id.write_direct_chunk((6, 0), noise[6:9].tobytes(), filter_mask=1)
     with h5py.File(shard) as file:
-        masks = {file["robot_state"].id.get_chunk_info(k).filter_mask for k in range(5)}
-    assert masks != {0}  # gzip was left out of some chunks: the case that is meant
+        assert np.array_equal(file["robot_state"][()], noise)
     shard_again = Shard(shard)
     for name, values in expected.items():
         assert np.array_equal(shard_again.read(name, 0, len(values)), values), name
