@@ -280,6 +280,7 @@ def _import_all() -> None:
     import torch
 
     import navrep_data.datasets
+    import navrep_data.doctor
     import navrep_data.evaluate
     import navrep_data.testing
     import navrep_data.train

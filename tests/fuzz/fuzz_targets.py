@@ -204,11 +204,12 @@ def _read_worlds(folder: Path) -> None:
 
 
 def _read_dataset(folder: Path) -> None:
-    from navrep_data.shards import DatasetFolder, verify
+    from navrep_data.doctor import check_dataset
+    from navrep_data.shards import DatasetFolder
     from navrep_data.view import dataset_page
 
     _each(
-        lambda: verify(folder),
+        lambda: check_dataset(folder),  # all of verify, too
         lambda: _use_windows(folder),
         lambda: dataset_page(folder, max_bytes=1 << 20),
         lambda: DatasetFolder(folder).episodes.in_split("train"),
