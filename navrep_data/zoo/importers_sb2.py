@@ -102,8 +102,9 @@ def load_controller_zip(path: Path | str) -> Controller | EndToEnd:
             raise CheckpointError(
                 f"{path}: {name!r} has {members[name].file_size:,} bytes unpacked, expected at most {bound:,}."
             )
+    listed = read_member(path, members["parameter_list"])
     try:
-        names = json.loads(read_member(path, members["parameter_list"]))
+        names = json.loads(listed)
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{path}: 'parameter_list' is not valid JSON ({str(error)[:80]}).") from error
     arrays_file = read_member(path, members["parameters"])
