@@ -509,7 +509,7 @@ def _read_results(folder: Path) -> None:
 
     def load() -> None:
         results = Results.load(folder / "results.json")
-        assert results.name, results.physics
+        f"{results.name} {results.physics}".encode()
         results.first(3).save(folder / "again.json")
 
     _each(lambda: results_page(folder / "results.json", max_bytes=1 << 20), load)
