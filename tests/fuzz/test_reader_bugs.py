@@ -80,6 +80,24 @@ def test_a_manifest_that_is_nested_as_deep_as_python_parses(files):
         refused(lambda: BY_NAME["manifest"].read(files), CorruptDataError)
 
 
+@of("manifest")
+@pytest.mark.parametrize(
+    ("name", "key", "value"),
+    [("action", "mean", None), ("action", "std", [1.0]), ("reward", "min", [1.0]), ("scan", "count", None),
+     ("action", "max", [1, 2, "x"]), ("reward", "mean", True)],
+)  # fmt: skip
+def test_statistics_that_are_no_table(files, name, key, value):
+    """Found by fuzzing: the card of such a manifest could not be written."""
+    values = json.loads((files / "manifest.json").read_bytes())
+    for statistics in (values["statistics"], values["shards"][0]["statistics"]):
+        statistics["columns"][name][key] = value
+    (files / "manifest.json").write_text(json.dumps(values))
+    target = BY_NAME["manifest"]
+    for file, data in target.seal(load_files(files)).items():
+        (files / file).write_bytes(data)
+    refused(lambda: target.read(files), CorruptDataError, "statistics' holds something else than numbers")
+
+
 @of("results")
 @pytest.mark.parametrize(
     "change",
