@@ -43,7 +43,7 @@ except MemoryError as error:
     "outside": "(folder / '../outside.txt').write_text('x')",
 }
 FOUND = {
-    "crash": "KeyError: 'x'", "several lines": "or several lines", "memory": "reading took 6",
+    "crash": "KeyError: 'x'", "several lines": "or several lines", "memory": "fuzz._Found: reading took ",
     "memory ran out": "memory ran out before", "hang": "the process died", "standstill": "the process died",
     "death": "the process died", "outside": "files outside the folder",
 }  # fmt: skip
