@@ -34,6 +34,7 @@ from navrep_data.train.controller_recipe import (
 from navrep_data.train.encode import vae_of, weights_hash
 from navrep_data.train.logs import Logger, curve
 from navrep_data.train.ppo_policy import BoundedPolicy
+from navrep_data.train.world_models import claim, machine
 from navrep_data.train.worlds import TrainingWorlds, play
 from navrep_data.zoo.local import PARTS, POLICY_FILE
 from navrep_data.zoo.policy import Policy
@@ -201,8 +202,6 @@ def train_controller(
     torch.manual_seed(recipe.seed)
     network = make_network(recipe, model) if init is None else _network_of(init, recipe, model)
     used = None if recipe.features == "e2e" else weights_hash(model)
-    from navrep_data.train.world_models import claim
-
     claim(
         out, recipe.to_dict(), {"world_model": model_name, "world_model_sha256": used}, resume, free=("validate_every",)
     )
@@ -398,5 +397,6 @@ class _Run(BaseCallback):
             "selected_on": f"navrep-test, original physics, numpy seeds {seeds.start} to {seeds.stop - 1}",
             "step": self.at.step,
             "seconds": round(self.at.seconds, 1),
+            "machine": machine(self.ppo.device),
             "best_validation": None if self.at.best is None else 1.0 - self.at.best,
         }
