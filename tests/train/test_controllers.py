@@ -18,6 +18,7 @@ from navrep_data.train.controller_recipe import (
     original_controller_recipe,
 )
 from navrep_data.train.logs import read_log
+from navrep_data.train.state import last_folder
 from navrep_data.train.worlds import TrainingWorlds, play, shorten
 from navrep_data.zoo.local import load_any_model
 from navrep_data.zoo.policy import Policy
@@ -143,6 +144,27 @@ def test_resume_goes_on_and_refuses_other_settings(few_episodes, tmp_path):
     done = controllers.train_controller(recipe, out, model=model, resume=True)
     assert done.steps == 128
     assert [r["step"] for r in read_log(out) if "val_success" in r] == ["64", "128"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("features", ["z", "zh", "e2e"])
+def test_a_resume_gives_the_same_weights(features, few_episodes, tmp_path):
+    model = None if features == "e2e" else world_model()
+    # 24 steps per world between checkpoints: episodes are cut there, and some end and adapt their difficulty
+    recipe = default_controller_recipe(features, "1d").replace(**{**SMALL, "rollout": 24, "steps": 576, "batch": 64,
+                                                                  "validate_every": 192})  # fmt: skip
+    controllers.train_controller(recipe, tmp_path / "whole", model=model)
+    controllers.train_controller(recipe, tmp_path / "parts", model=model, stop_after=192)
+    controllers.train_controller(recipe, tmp_path / "parts", model=model, resume=True, stop_after=384)
+    controllers.train_controller(recipe, tmp_path / "parts", model=model, resume=True)
+    ours, theirs = (checkpoint.load(last_folder(tmp_path / name)) for name in ("whole", "parts"))
+    for (name, a), b in zip(ours.named_parameters(), theirs.parameters(), strict=True):
+        assert torch.equal(a, b), name
+    a, b = (
+        [{k: v for k, v in r.items() if k not in ("seconds", "steps_per_s")} for r in read_log(tmp_path / name)]
+        for name in ("whole", "parts")
+    )
+    assert a[-1] == b[-1]
 
 
 @pytest.mark.slow
