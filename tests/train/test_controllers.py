@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from navrep_data import zoo
 from navrep_data.errors import CheckpointError, ConfigError, DatasetMismatchError
 from navrep_data.models import Controller, ControllerConfig, checkpoint
 from navrep_data.models.controllers import limit_speed
@@ -117,10 +118,12 @@ def test_a_few_steps_leave_a_policy_that_loads_and_drives(features, few_episodes
 
 
 @pytest.mark.slow
-def test_ppo_moves_actor_critic_and_width_and_nothing_of_the_encoder(few_episodes, tmp_path):
-    model = world_model()
-    before = {name: p.clone() for name, p in model.named_parameters()}
-    recipe = default_controller_recipe("z", "1d").replace(**{**SMALL, "steps": 64})
+@pytest.mark.parametrize("features", ["z", "h", "zh", "e2e"])
+def test_ppo_moves_actor_critic_and_width_and_nothing_of_the_encoder(features, few_episodes, tmp_path):
+    """End to end it moves the convolutions, too."""
+    model = None if features == "e2e" else world_model()
+    before = {} if model is None else {name: p.clone() for name, p in model.named_parameters()}
+    recipe = default_controller_recipe(features, "1d").replace(**{**SMALL, "steps": 64})
     controllers.train_controller(recipe, tmp_path / "a", model=model, stop_after=64)
     first = checkpoint.load(tmp_path / "a" / "checkpoints" / "step-00000064")
     controllers.train_controller(recipe.replace(lr=1e-9), tmp_path / "b", model=model, stop_after=64)
@@ -128,7 +131,8 @@ def test_ppo_moves_actor_critic_and_width_and_nothing_of_the_encoder(few_episode
     for name, p in first.named_parameters():
         moved = float((p - dict(still.named_parameters())[name]).detach().abs().max())
         assert (moved > 1e-5) == (not name.startswith("q.")), name
-    assert all(torch.equal(p, before[name]) for name, p in model.named_parameters())
+    if model is not None:
+        assert all(torch.equal(p, before[name]) for name, p in model.named_parameters())
 
 
 @pytest.mark.slow
@@ -205,6 +209,20 @@ def test_a_network_is_continued(few_episodes, tmp_path):
         torch.testing.assert_close(p, before[name], rtol=1e-4, atol=1e-6)
     with pytest.raises(CheckpointError, match="do not fit"):
         controllers.train_controller(recipe.replace(features="zh"), tmp_path / "d", model=model, init=init)
+
+
+@pytest.mark.slow
+def test_a_released_policy_is_continued(shared, few_episodes, tmp_path, monkeypatch):
+    monkeypatch.setenv("NAVREP_RELEASED_DIR", str(shared / "released"))
+    init = zoo.load("transformer_1d_z.released")
+    model = zoo.load("transformer_1d.released")
+    recipe = default_controller_recipe("z", "1d").replace(**{**SMALL, "steps": 64, "lr": 1e-9})
+    controllers.train_controller(recipe, tmp_path / "c", model=model, model_name="transformer_1d.released", init=init)
+    policy = load_any_model(tmp_path / "c")
+    scan, state = Simulator(environment(recipe), 6, seed=1).observe()
+    for one in (policy, init):
+        one.reset(batch_size=6)
+    np.testing.assert_allclose(policy.act(scan, state), init.act(scan, state), atol=1e-3)
 
 
 def test_bad_input(tmp_path):
