@@ -198,7 +198,7 @@ class _Run(BaseCallback):
         self._seed()
         try:
             if self.at.step < stop:
-                self.ppo.learn(stop - self.at.step, callback=self, reset_num_timesteps=False)
+                self._learn(stop - self.at.step)
                 self._checkpoint(validate=True)
         finally:
             self.bar.close()
@@ -211,6 +211,23 @@ class _Run(BaseCallback):
             report(f"{self.out}: {self.at.step:,} steps, {rate:,.0f} steps/s, best validation {best:.1%}{more}")
         curve(self.out)
         return TrainedController(self.out, self.at.step, best, rate, held_out)
+
+    def _learn(self, steps: int) -> None:
+        try:
+            self.ppo.learn(steps, callback=self, reset_num_timesteps=False)
+        except ValueError:  # torch's distributions refuse what is not finite
+            self._check_finite()
+            raise
+
+    def _check_finite(self) -> None:
+        """Raise where an update left weights that are not finite: nothing of that is saved."""
+        if all(bool(torch.isfinite(p).all()) for p in self.ppo.policy.parameters()):
+            return
+        last = state.last_folder(self.out)
+        kept = f"The last good checkpoint is {last}" if last is not None else "There is no checkpoint yet"
+        raise TrainingError(
+            f"Weights are NaN after {self.ppo.num_timesteps:,} steps, expected finite ones. {kept}; lower lr."
+        )
 
     # --- callback ----------------------------------------------------------------------------------------------
 
@@ -225,6 +242,7 @@ class _Run(BaseCallback):
             self.ppo.lr_schedule = lambda _: rate
         if now == self.at.step:
             return
+        self._check_finite()
         due = now // self.recipe.validate_every > self.at.step // self.recipe.validate_every
         self._log(now)
         if due:
@@ -269,11 +287,7 @@ class _Run(BaseCallback):
         )  # fmt: skip
 
     def _checkpoint(self, validate: bool) -> None:
-        if self.ppo.num_timesteps > self.at.step and not self._finite():
-            last = state.last_folder(self.out)
-            raise TrainingError(
-                f"Weights are NaN after {self.ppo.num_timesteps:,} steps. The last good checkpoint is {last}: lower lr."
-            )
+        self._check_finite()
         clock = time.perf_counter()
         self.spent += clock - self.began
         self.at.step = self.ppo.num_timesteps
@@ -289,9 +303,6 @@ class _Run(BaseCallback):
         state.commit(self.out, self.at)
         state.publish(self.out, self.at.best_step)
         self.began = time.perf_counter()
-
-    def _finite(self) -> bool:
-        return all(bool(torch.isfinite(p).all()) for p in self.ppo.policy.parameters())
 
     def _success(self, seeds: range) -> float:
         """Return the share of validation episodes that end at the goal; the policy acts by its mean."""

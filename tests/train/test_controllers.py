@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from navrep_data import zoo
-from navrep_data.errors import CheckpointError, ConfigError, DatasetMismatchError
+from navrep_data.errors import CheckpointError, ConfigError, DatasetMismatchError, TrainingError
 from navrep_data.models import Controller, ControllerConfig, checkpoint
 from navrep_data.models.controllers import limit_speed
 from navrep_data.schema import Event
@@ -169,6 +169,24 @@ def test_a_resume_gives_the_same_weights(features, few_episodes, tmp_path):
         for name in ("whole", "parts")
     )
     assert a[-1] == b[-1]
+
+
+@pytest.mark.slow
+def test_nan_stops_and_keeps_the_last_good_checkpoint(few_episodes, tmp_path, monkeypatch):
+    step_wait, steps = TrainingWorlds.step_wait, []
+
+    def poisoned(self):
+        obs, rewards, done, infos = step_wait(self)
+        steps.append(0)
+        return obs, rewards * (np.float32("nan") if len(steps) > 12 else 1), done, infos
+
+    monkeypatch.setattr(TrainingWorlds, "step_wait", poisoned)
+    recipe = default_controller_recipe("z", "1d").replace(**SMALL)
+    with pytest.raises(TrainingError, match=r"Weights are NaN after 128 steps.*step-00000064; lower lr") as error:
+        controllers.train_controller(recipe, tmp_path / "c", model=world_model())
+    assert "\n" not in str(error.value)
+    assert last_folder(tmp_path / "c").name == "step-00000064"
+    assert load_any_model(tmp_path / "c").features == "z"
 
 
 @pytest.mark.slow

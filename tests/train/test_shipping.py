@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from navrep_data import zoo
+from navrep_data.cli.main import run
 from navrep_data.errors import CheckpointError, ConfigError, CorruptDataError, DatasetMismatchError, UnknownNameError
 from navrep_data.evaluate.sources import weights_of
 from navrep_data.evaluate.world_model import world_model_error
@@ -138,7 +139,7 @@ def test_the_record_says_how_it_was_made(trained, package, dataset):
     assert recipe["machine"] == w.training["machine"]
 
 
-def test_names_lists_and_checks_know_them(trained, package, dataset):
+def test_names_lists_and_checks_know_them(trained, package, dataset, capsys):
     with pytest.raises(UnknownNameError, match=rf"means {VARIANT}\.v1.*does not contain it.*{VARIANT}\.released"):
         zoo.load(VARIANT)
     w, c = ship(trained, package, dataset)
@@ -150,6 +151,10 @@ def test_names_lists_and_checks_know_them(trained, package, dataset):
     report = zoo.verify(f"{VARIANT}*.v1")
     assert [(check.name, check.status) for check in report.checks] == [(w.name, "ok"), (c.name, "ok")]
     assert "trained by navrep-data" in "\n".join(cards.describe(c))
+    with pytest.raises(SystemExit):
+        run(["models", f"{VARIANT}_z*"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split("  = ")[1] for line in lines if line.startswith(c.name)] == [f"{VARIANT}_z, ours"]
 
 
 def test_a_damaged_file_is_refused(trained, package, dataset):
