@@ -38,7 +38,7 @@ class _VerbOrPattern(typer.core.TyperGroup):
 
 models_app = typer.Typer(
     cls=_VerbOrPattern,
-    help="List checkpoints, NavRep's released ones and our own ([PATTERN], --json), or show, fetch, verify, convert them.",
+    help="List checkpoints, the released ones and our own ([PATTERN], --json), or show, fetch, verify, convert them.",
     subcommand_metavar="[PATTERN] | VERB [ARGS]...",
 )
 
