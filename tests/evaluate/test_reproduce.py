@@ -36,7 +36,7 @@ def results(folder, name, outcome, suite="navrep27", variant=None, physics="orig
 
 
 @pytest.fixture
-def measured(tmp_path):
+def measured(tmp_path, maps):
     """Two runs of one released variant, one of another, one of ours, and a baseline; 27 episodes each."""
     results(tmp_path, "e2e_1d.20201026", "S" * 9 + "C" * 18)
     results(tmp_path, "e2e_1d.20201027", "S" * 18 + "C" * 9)
@@ -106,7 +106,7 @@ def test_table_has_a_column_per_source_and_the_goal_beside(measured):
     assert text == done.text
     lines = {
         cells[1]: cells[2:-1]
-        for line in text.split("\n## ")[1].splitlines()
+        for line in text.split("\n## ")[0].splitlines()
         if (cells := [c.strip() for c in line.split("|")])[1:]
     }
     assert lines["policy"][:3] == [

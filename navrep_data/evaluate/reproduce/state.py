@@ -63,7 +63,7 @@ def _draw(dataset: DatasetFolder, shard: int, start: int, row: int) -> Any:
     worlds = dataset.worlds(shard)
     world = worlds.episode(int(np.flatnonzero(worlds.arrays["row"] == start)[0]))
     polygons = [*world.polygons, *([world.border] if world.border is not None else [])]
-    humans = _to_world(read("humans"), pose) if "humans" in dataset.columns else None
+    humans = _to_world(read("humans"), pose) if "humans" in dataset.manifest.columns else None
     figure = new_figure(11.5, 6.2)
     axes = figure.subplot_mosaic("WSS;WRG", width_ratios=[1.9, 1.0, 1.0])
     draw_world(

@@ -46,7 +46,8 @@ def _merge(parts: Sequence[dict[str, Any]], runs: Sequence[dict[str, Any]]) -> S
     if len(rates) > 1:
         value, low, high = spread(rates)
     else:
-        value, low, high = rates[0], parts[0]["success_rate_low"], parts[0]["success_rate_high"]
+        only = next(p for p in parts if p["success_rate"] is not None)
+        value, low, high = rates[0], only["success_rate_low"], only["success_rate_high"]
     return {"value": value, "low": low, "high": high, "runs": names, "episodes": episodes}
 
 

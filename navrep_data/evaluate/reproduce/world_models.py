@@ -61,7 +61,9 @@ def _draw(found: list[Found], left_out: int) -> Any:
         results = [r for r, _ in found if r.lidar == lidar]
         for ax, kind in zip(row, ("scan", "goal"), strict=True):
             _bars(ax, results, kind)
-        row[0].set_ylabel(f"{lidar if lidar == 'rings' else '1D'}\nMSE ({_LIDARS[lidar].split(', ')[1]})", fontsize=8)
+        row[0].set_ylabel(
+            f"{lidar if lidar == 'rings' else '1D'}\nMSE ({_LIDARS[lidar].split(', ', 1)[1]})", fontsize=8
+        )
         row[1].set_ylabel("MSE [m$^2$]", fontsize=8)
     axes[0, 0].set_title("lidar state $s_l$", fontsize=9)
     axes[0, 1].set_title("goal of $s_r$", fontsize=9)
