@@ -70,7 +70,7 @@ def test_half_precision_takes_half_the_bytes_and_rounds(tmp_path):
 
 
 @pytest.mark.parametrize(("said", "words"), [("int8", "weights_dtype is 'int8'"), (["x"], "weights_dtype is"),
-                                             ("float16", "expected a little over")])  # fmt: skip
+                                             ("float16", "is torch.float32, expected float16")])  # fmt: skip
 def test_wrong_storage_is_refused(saved, said, words):
     edit(saved, weights_dtype=said)
     with pytest.raises(CheckpointError, match=words):
