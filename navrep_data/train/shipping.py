@@ -75,7 +75,8 @@ def ship(
     commands : sequence of str
         The command lines that made it, first to last; those of the variant's recipe file if left out.
     before : sequence of path-like
-        Output folders of trainings that came before, whose time counts too: V's for modular models.
+        Output folders of trainings that came before, whose time counts too: V's for modular models, earlier stages that
+        ``--init`` went on from.
     world_model : str, optional
         Full name of the shipped world model that a controller sees through; by the variant's name if left out.
     root : pathlib.Path, optional
@@ -170,7 +171,10 @@ def _recipe(
     """Return the recipe file of a variant with the training's settings, time and machine."""
     found: Any = read_json(path, _MAX_JSON) if path.is_file() else {"name": f"{variant}.{OWN}", "commands": []}
     used = training.metadata["recipe"]
-    settings = used if not before else {"v": before[0].metadata["recipe"], "m": used}
+    earlier = [t.metadata["recipe"] for t in before]
+    modular = training.policy is None and training.model is not None and training.model.config.kind == "modular"
+    # V and M of modular models are two trainings of one recipe; others may have been trained in stages
+    settings = {"v": earlier[0], "m": used} if modular and earlier else used
     if not commands and found.get("settings") != settings:
         old = found.get("settings") or {}
         other = sorted(k for k in {*old, *settings} if old.get(k) != settings.get(k))
@@ -183,6 +187,7 @@ def _recipe(
         **found,
         "commands": list(commands) or found["commands"],
         "settings": settings,
+        **({"stages_before": earlier} if earlier and not modular else {}),
         "wall_time_s": round(sum(times)),
         "machine": training.metadata.get("machine"),
         "notes": "Commands in order; settings are those that the training command takes from them. Seeds fixed. The "
@@ -264,6 +269,7 @@ def _provenance(training: _Training, recipe: dict[str, Any], cost: Rounding) -> 
     found = {
         "commands": recipe["commands"],
         "settings": recipe["settings"],
+        **({"stages_before": recipe["stages_before"]} if "stages_before" in recipe else {}),
         "seed": metadata["recipe"]["seed"],
         "step": metadata["step"],
         "steps": training.step,
@@ -340,7 +346,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     weights.add_argument("--as", dest="variant", required=True, metavar="VARIANT")
     weights.add_argument("--data", type=Path, required=True, help="dataset for the cost of half precision")
     weights.add_argument("--command", action="append", default=[], help="a command that made it; once for each")
-    weights.add_argument("--before", type=Path, action="append", default=[], help="V's folder, for modular models")
+    weights.add_argument("--before", type=Path, action="append", default=[], help="V's folder, or an earlier stage's")
     weights.add_argument("--world-model", metavar="NAME")
     measured = verbs.add_parser("results", help="what was measured -> record")
     measured.add_argument("name")

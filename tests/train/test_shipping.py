@@ -139,6 +139,17 @@ def test_the_record_says_how_it_was_made(trained, package, dataset):
     assert recipe["machine"] == w.training["machine"]
 
 
+def test_stages_before_count(trained, package, dataset):
+    recipes = package.parent / "recipes"
+    options = {"commands": ["a", "b"], "root": package, "recipes": recipes}
+    alone = shipping.ship(trained / "w", VARIANT, dataset, **options).training
+    both = shipping.ship(trained / "w", VARIANT, dataset, before=[trained / "w"], **options).training
+    assert both["settings"] == alone["settings"]
+    assert both["stages_before"] == [alone["settings"]]
+    assert both["seconds"] >= alone["seconds"]
+    assert "stages_before" not in alone
+
+
 def test_names_lists_and_checks_know_them(trained, package, dataset, capsys):
     with pytest.raises(UnknownNameError, match=rf"means {VARIANT}\.v1.*does not contain it.*{VARIANT}\.released"):
         zoo.load(VARIANT)

@@ -132,7 +132,10 @@ def _bars(ax: Any, i: int, measured: dict[str, dict[str, Score]], theirs: float 
             top = 100 * score["high"]
             error = [[max(0.0, value - 100 * score["low"])], [max(0.0, top - value)]]
             ax.errorbar(x, value, error, color="black", capsize=2, linewidth=0.8, zorder=3)
-        ax.annotate(f"{value:.0f}", (x, top), (0, 1), textcoords="offset points", ha="center", fontsize=6)
+        box = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75}
+        ax.annotate(
+            f"{value:.0f}", (x, top), (0, 2), textcoords="offset points", ha="center", fontsize=6, bbox=box, zorder=4
+        )
 
 
 def _legend(figure: Any, kinds: Sequence[str], goal: bool) -> None:
@@ -152,9 +155,12 @@ def _legend(figure: Any, kinds: Sequence[str], goal: bool) -> None:
 def _note(found: Sequence[Results]) -> str:
     played = sorted({sum(c != "-" for c in r.outcome) for r in found})
     each = f"{played[0]:,}" if len(played) == 1 else f"{played[0]:,} to {played[-1]:,}"
+    seen = sorted({f"{r.name} sees {r.header['sees']}" for r in found if source_of(r.header["name"]) == "baseline"})
+    baselines = f" {'; '.join(seen)}." if seen else ""
     return (
         f"Measured: {each} episodes per policy, original physics; intervals of 95 % (Wilson), or least to greatest of "
         "several runs. The authors' bars are read off their figure (+-0.5), theirs are of other episodes."
+        + (f"\n{baselines.strip()}" if baselines else "")
     )
 
 
@@ -243,9 +249,8 @@ def _one_table(suite: str, measured: dict[str, dict[str, dict[str, Score]]]) -> 
             cells.append(_cell(None if of is None else of["all"]))
         sources += [{"name": variant, "suite": suite, "source": k, **of["all"]}
                     for k, of in measured.get(variant, {}).items()]  # fmt: skip
-        sources += [{"name": variant, "suite": suite, "source": "authors", "value": theirs[variant]}] * (
-            variant in theirs
-        )
+        if variant in theirs:
+            sources.append({"name": variant, "suite": suite, "source": "authors", "value": theirs[variant]})
         lines.append([*cells, goal])
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines), sources
 
