@@ -99,4 +99,4 @@ def _draw_robot_state(ax: Any, robot_state: np.ndarray[Any, Any]) -> None:
     ax.set_aspect("equal")
     ax.set_xticks([])
     ax.set_yticks([])
-    ax.set_title("$s_r$: goal and velocity", fontsize=9)
+    ax.set_title("$s_r$: goal and velocity, ahead is up", fontsize=9)

@@ -8,10 +8,9 @@ from typing import Any
 
 from navrep_data.evaluate.figures import MAX_ROWS, comparison, new_figure
 from navrep_data.evaluate.reproduce.drawn import COLOURS, HATCHES, Drawn, Missing, authors, label, shipped
-from navrep_data.evaluate.results import Results
-from navrep_data.evaluate.scores import summary
+from navrep_data.evaluate.results import NOT_PLAYED, Results
 from navrep_data.evaluate.sources import find_benchmarks, source_of
-from navrep_data.evaluate.statistics import spread
+from navrep_data.evaluate.statistics import spread, wilson
 from navrep_data.sim.scenarios import MAP_GROUPS
 
 PARTS = ("all", *MAP_GROUPS)
@@ -25,29 +24,38 @@ def scores(found: Sequence[Results]) -> dict[str, dict[str, dict[str, Score]]]:
 
     Several runs of a variant are one score, from the least to the greatest of them; a single one has Wilson's interval.
     """
-    rows: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    runs: dict[tuple[str, str], list[Results]] = {}
     for results in found:
         if results.header["settings"]["inference"] == "deterministic":
             source = source_of(results.header["name"])
             name = results.header["name"].partition(".")[0] if source == "ours" else results.header["variant"]
-            rows.setdefault((name, source), []).append(summary(results))
+            runs.setdefault((name, source), []).append(results)
     merged: dict[str, dict[str, dict[str, Score]]] = {}
-    for (variant, source), runs in rows.items():
-        parts = {"all": runs} | {m: [r["per_map"][m] for r in runs] for m in runs[0].get("per_map", {})}
-        merged.setdefault(variant, {})[source] = {part: _merge(of, runs) for part, of in parts.items()}
+    for (variant, source), of in runs.items():
+        parts = ("all", *of[0].suite.maps)
+        merged.setdefault(variant, {})[source] = {part: _merge(of, part) for part in parts}
     return merged
 
 
-def _merge(parts: Sequence[dict[str, Any]], runs: Sequence[dict[str, Any]]) -> Score:
-    names, episodes = [r["name"] for r in runs], sum(p["episodes"] for p in parts)
-    rates = [p["success_rate"] for p in parts if p["success_rate"] is not None]
-    if not rates:
+def _count(results: Results, part: str = "all") -> tuple[int, int]:
+    """Return the episodes that reached the goal, and those played, of all scenarios or of one map's."""
+    suite = results.suite
+    letters = [
+        letter
+        for k, letter in enumerate(results.outcome)
+        if letter != NOT_PLAYED and part in ("all", suite.scenarios[suite.scenario(k)].map)
+    ]
+    return letters.count("S"), len(letters)
+
+
+def _merge(runs: Sequence[Results], part: str) -> Score:
+    counts = [_count(r, part) for r in runs]
+    names, episodes = [r.name for r in runs], sum(n for _, n in counts)
+    counts = [c for c in counts if c[1]]
+    if not counts:
         return {"value": None, "low": None, "high": None, "runs": names, "episodes": episodes}
-    if len(rates) > 1:
-        value, low, high = spread(rates)
-    else:
-        only = next(p for p in parts if p["success_rate"] is not None)
-        value, low, high = rates[0], only["success_rate_low"], only["success_rate_high"]
+    rates = [won / n for won, n in counts]
+    value, low, high = spread(rates) if len(rates) > 1 else (rates[0], *wilson(*counts[0]))
     return {"value": value, "low": low, "high": high, "runs": names, "episodes": episodes}
 
 
@@ -188,17 +196,15 @@ def trajectories(folder: Path) -> Drawn:
     lacks = missing(folder, "navrep27", _names(found))
     if not found:
         return Drawn(missing=lacks)
-    ranked = sorted(found, key=lambda r: -(summary(r)["success_rate"] or 0.0))
+    rate = {r.name: _merge([r], "all")["value"] or 0.0 for r in found}
+    ranked = sorted(found, key=lambda r: -rate[r.name])
     most = {"ours": 3, "released": 3, "other": 1, "baseline": 1}
     chosen: list[Results] = []
     for source, n in most.items():
         chosen += [r for r in ranked if source_of(r.header["name"]) == source][:n]
     chosen = chosen[:MAX_ROWS]
     labels = [f"{r.name}\n({label(source_of(r.header['name'])).split(',')[0]})" for r in chosen]
-    sources = [
-        {"name": r.name, "source": source_of(r.header["name"]), "success_rate": summary(r)["success_rate"]}
-        for r in chosen
-    ]
+    sources = [{"name": r.name, "source": source_of(r.header["name"]), "success_rate": rate[r.name]} for r in chosen]
     return Drawn(comparison(chosen, labels), sources=sources, missing=lacks)
 
 
