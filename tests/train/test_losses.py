@@ -135,7 +135,7 @@ def test_gradients_reach_every_weight_of_a_world_model(kind, original):
 
     torch.manual_seed(0)
     settings = {"lidar": "1d", "z_size": 16}
-    settings |= {"h_size": 8} if kind == "joint" else {"n_blocks": 2, "n_heads": 2, "context": 4}
+    settings |= {"h_size": 32} if kind == "joint" else {"n_blocks": 2, "n_heads": 2, "context": 4}
     model = checkpoint.make(kind, settings).train()
     # beyond the step at which the weight of the KL divergence has risen
     recipe = (original_recipe if original else default_recipe)(kind, "1d").replace(kl_floor=0.0)
