@@ -259,7 +259,7 @@ class _Run(BaseCallback):
         """Go on as a run that resumes from this checkpoint does: in new worlds, so that no world's state is kept."""
         self.worlds.restart(_stream(self.recipe, self.at.step), self.worlds.simulator.difficulty())
         self._seed()
-        self.ppo._last_obs = self.worlds.reset()  # type: ignore[assignment]
+        self.ppo._last_obs = self.worlds.reset()
         self.ppo._last_episode_starts = np.ones(self.worlds.num_envs, bool)
 
     def _log(self, now: int) -> None:

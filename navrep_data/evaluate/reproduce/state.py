@@ -61,6 +61,7 @@ def _draw(dataset: DatasetFolder, shard: int, start: int, row: int) -> Any:
     scan, pose, robot_state = read("scan"), read("robot_pose"), read("robot_state")
     metres = metres_from_millimetres(scan) if scan.dtype == np.uint16 else scan
     worlds = dataset.worlds(shard)
+    assert worlds is not None  # only datasets with worlds are looked at
     world = worlds.episode(int(np.flatnonzero(worlds.arrays["row"] == start)[0]))
     polygons = [*world.polygons, *([world.border] if world.border is not None else [])]
     humans = _to_world(read("humans"), pose) if "humans" in dataset.manifest.columns else None

@@ -14,7 +14,7 @@ from navrep_data.evaluate.world_model import WorldModelError
 ARCHITECTURES = ("joint", "modular", "transformer")
 _LIDARS = {"rings": "rings, values {0, 0.5, 1}", "1d": "1D, ranges / 25 m"}
 _ORDER = ("released", "ours", "other")
-_SHORT = 24
+_SHORT = 28
 
 Found = tuple[WorldModelError, dict[str, Any]]
 
@@ -100,6 +100,8 @@ def _bars(ax: Any, results: list[WorldModelError], kind: str) -> None:
 
 
 def _short(name: str) -> str:
+    """Return a name, or the end of a path, that fits under a bar."""
+    name = name.rstrip("/").rpartition("/")[2]
     return name if len(name) <= _SHORT else f"...{name[3 - _SHORT :]}"
 
 
