@@ -34,7 +34,7 @@ class Benchmark:
     Attributes
     ----------
     rows : list of dict
-        One per policy, in the order asked for; see :func:`navrep_data.evaluate.scores.summary`.
+        One per policy, in the order asked for; see :func:`navrep_data.evaluate.summary`.
     variants : list of dict
         Variants of which several runs were played.
     baseline : dict
@@ -105,7 +105,7 @@ def benchmark(
     batch : int, optional
         Worlds per process; numbers do not depend on it.
     progress : callable, optional
-        See :data:`Progress`.
+        Called with a policy's name, how many of its episodes are finished, and of how many.
 
     Returns
     -------

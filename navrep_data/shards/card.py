@@ -16,6 +16,20 @@ _MAX_LISTED = 1000
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 _SIZES_LARGE = ((10_000_000, "1M<n<10M"), (100_000_000, "10M<n<100M"), (1_000_000_000, "100M<n<1B"))
 
+_HUMANS = {
+    "orca": "humans that follow ORCA",
+    "planned": "humans that follow the shortest way round walls",
+    "static": "humans that stand still",
+    "constant-velocity": "humans that walk straight on",
+}
+# By name in the package asl-pepper-2d-sim; scenarios lie on three of them. Named here so that a card is a function of
+# its manifest alone, wherever it is made.
+_PAPER_MAPS = frozenset(
+    {"asl", "asl_office_j", "cla_glass_hall", "empty", "hg_main_hall", "openlab_office_j", "unity_scene_map"}
+    | {"original_ckk", "scrubbed_ckk", *(f"crowdmove{k}" for k in range(1, 7)), *(f"marktm{k}" for k in range(1, 4))}
+    | {"markclutter", "markcomplex", "markmaze", "marksimple", "marktrain"}
+)
+
 CITATION = """\
 @article{dugas2020navrep,
   title   = {NavRep: Unsupervised Representations for Reinforcement Learning
@@ -135,6 +149,18 @@ def _pictures(m: Manifest) -> str:
     return "\n".join([*lines, ""]) if lines else ""
 
 
+def _maps_note(m: Manifest) -> str:
+    """Say whose maps the worlds lie on; empty where there are none of the paper's."""
+    maps = m.config.get("maps")
+    named = isinstance(maps, list) and any(isinstance(name, str) and name in _PAPER_MAPS for name in maps)
+    if not named and not m.config.get("scenarios"):
+        return ""
+    return (
+        "The maps are those of the package `asl-pepper-2d-sim`, which states no licence: the licence of this dataset\n"
+        "does not cover them. No map file is part of it, but scans and pictures show where walls are.\n\n"
+    )
+
+
 def _lead(m: Manifest) -> str:
     return _part(m) + _pictures(m)
 
@@ -149,7 +175,9 @@ def _part(m: Manifest) -> str:
 
 
 def _limits(m: Manifest) -> str:
-    lines = ["* Simulated: flat ground, a planar lidar without noise, humans that follow ORCA."]
+    noise = "with noise" if m.config.get("scan_noise") or m.config.get("scan_dropout") else "without noise"
+    walk = _HUMANS.get(str(m.config.get("human_policy", "orca")), "humans that follow a script")
+    lines = [f"* Simulated: flat ground, a planar lidar {noise}, {walk}."]
     if m.scan_dtype == "uint16":
         lines.append(
             "* Scans are rounded to millimetres: about 1 frame in 8 has one rings cell one bin off that of float32."
@@ -197,7 +225,7 @@ scans, robot states, actions, rewards and the crowd behind them.
 Environment `{m.env}`, `{m.physics}` physics, seed {m.seed}.
 {len(m.shards):,} HDF5 shards, {m.bytes:,} bytes ({m.bytes / max(m.rows, 1):,.0f} per step).
 
-Made by navrep-data, an independent re-implementation of the simulator of NavRep (Dugas et al. 2020);
+{_maps_note(m)}Made by navrep-data, an independent re-implementation of the simulator of NavRep (Dugas et al. 2020);
 it is not made or endorsed by the NavRep authors. If you use it, please cite their paper:
 
 ```bibtex

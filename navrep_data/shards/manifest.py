@@ -74,7 +74,7 @@ class Manifest:
     extras : tuple of FileEntry
         What a published dataset has besides: pictures for its card, an index of its episodes.
     partial : dict or None
-        In a copy that holds some shards only: what the whole has, see :data:`PARTIAL_FIELDS`.
+        In a copy that holds some shards only: what the whole has: hash of its manifest, shards, sequences, rows.
     format_version : int
         Version of the format.
     """
