@@ -174,10 +174,32 @@ def _part(m: Manifest) -> str:
     )
 
 
+def _seed(m: Manifest) -> str:
+    return f"made out of {len(m.source)} datasets" if len(m.source) > 1 else f"seed {m.seed}"
+
+
+def _length(m: Manifest) -> str:
+    return f"at most {m.length:,}" if m.source else f"{m.length:,}"
+
+
+def _sources(m: Manifest) -> str:
+    """Return the lines that name the datasets that this one was made out of."""
+    if not m.source:
+        return ""
+    lines = [f"* {record.get('name', 'a dataset')}: content `{record['content_hash']}`" for record in m.source]
+    return "\n".join(
+        ["Made out of:\n", *lines, "", "Which sequence and row is where: `source` in `manifest.json`.\n", ""]
+    )
+
+
 def _limits(m: Manifest) -> str:
-    noise = "with noise" if m.config.get("scan_noise") or m.config.get("scan_dropout") else "without noise"
-    walk = _HUMANS.get(str(m.config.get("human_policy", "orca")), "humans that follow a script")
-    lines = [f"* Simulated: flat ground, a planar lidar {noise}, {walk}."]
+    # of several datasets made into one, `config` has what they share; what differs is with each
+    configs = [c if isinstance(c := record.get("config"), dict) else m.config for record in m.source] or [m.config]
+    noise = "with noise" if any(c.get("scan_noise") or c.get("scan_dropout") for c in configs) else "without noise"
+    walks = [_HUMANS.get(str(c.get("human_policy", "orca")), "humans that follow a script") for c in configs]
+    lines = [f"* Simulated: flat ground, a planar lidar {noise}, {' or '.join(dict.fromkeys(walks))}."]
+    if m.physics == "recorded":
+        lines = ["* Recorded with a robot: people, obstacles and the robot's radius are not known."]
     if m.scan_dtype == "uint16":
         lines.append(
             "* Scans are rounded to millimetres: about 1 frame in 8 has one rings cell one bin off that of float32."
@@ -220,9 +242,9 @@ def dataset_card(manifest: Manifest) -> str:
 
 # navrep-data: {m.env}
 
-{_lead(m)}{m.rows:,} steps of a robot among humans, in {m.sequences:,} sequences of {m.length:,} steps: lidar
+{_lead(m)}{m.rows:,} steps of a robot among humans, in {m.sequences:,} sequences of {_length(m)} steps: lidar
 scans, robot states, actions, rewards and the crowd behind them.
-Environment `{m.env}`, `{m.physics}` physics, seed {m.seed}.
+Environment `{m.env}`, `{m.physics}` physics, {_seed(m)}.
 {len(m.shards):,} HDF5 shards, {m.bytes:,} bytes ({m.bytes / max(m.rows, 1):,.0f} per step).
 
 {_maps_note(m)}Made by navrep-data, an independent re-implementation of the simulator of NavRep (Dugas et al. 2020);
@@ -239,7 +261,7 @@ it is not made or endorsed by the NavRep authors. If you use it, please cite the
 ```
 
 Versions: {versions or "(not recorded)"}. Policy: `{json.dumps(m.policy, ensure_ascii=False)}`.
-{m.sensor.n_rays} rays from {m.sensor.angle_min:g} rad, {m.sensor.angle_increment:.6g} rad apart,
+{_sources(m)}{m.sensor.n_rays} rays from {m.sensor.angle_min:g} rad, {m.sensor.angle_increment:.6g} rad apart,
 anticlockwise; up to {m.sensor.range_max:g} m; one step is {m.sensor.dt:g} s.
 
 ## Columns
