@@ -20,6 +20,7 @@ from navrep_data.cli import (
     info,
     models,
     play,
+    reproduce,
     tools,
     train,
     verify,
@@ -58,6 +59,7 @@ app.add_typer(models.models_app, name="models")
 app.command("encode")(encode.encode_command)
 app.add_typer(train.train_app, name="train")
 app.add_typer(evaluate.evaluate_app, name="evaluate")
+app.command("reproduce")(reproduce.reproduce_command)
 
 # Newer typers carry their own click; these are the classes that the installed one raises, whichever that is.
 _UsageError: type[Any] = typer.BadParameter.__mro__[1]

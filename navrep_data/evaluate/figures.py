@@ -48,17 +48,18 @@ def draw(
     folder : pathlib.Path
         Where to.
     """
-    files = [_save(bars(rows, groups, baseline), folder / "success.png")]
+    files = [save(bars(rows, groups, baseline), folder / "success.png")]
     if len(found[0].suite.scenarios) == 1:
-        return [*files, _save(overlay(found, rows), folder / "trajectories.png")]
-    files.append(_save(comparison(found[:MAX_ROWS]), folder / "trajectories.png"))
+        return [*files, save(overlay(found, rows), folder / "trajectories.png")]
+    files.append(save(comparison(found[:MAX_ROWS]), folder / "trajectories.png"))
     for results in found:
         plain = "".join(c if c.isalnum() or c in "._-" else "-" for c in results.name)
-        files.append(_save(grid(results), folder / f"trajectories-{plain}.png"))
+        files.append(save(grid(results), folder / f"trajectories-{plain}.png"))
     return files
 
 
-def _save(figure: Any, path: Path) -> Path:
+def save(figure: Any, path: Path) -> Path:
+    """Write a figure as PNG and return the path."""
     from PIL import Image
 
     drawn, packed = io.BytesIO(), io.BytesIO()
@@ -70,7 +71,8 @@ def _save(figure: Any, path: Path) -> Path:
     return path
 
 
-def _figure(width: float, height: float) -> Any:
+def new_figure(width: float, height: float) -> Any:
+    """Return an empty figure of this size [inch]."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
@@ -105,7 +107,7 @@ def bars(rows: Sequence[Row], groups: Sequence[Row], baseline: Row) -> Any:
     """Return the figure of success per policy, overall and per map, with intervals; `goal` is the dashed line."""
     parts = [None, *rows[0].get("per_map", {})]
     n = len(_series(rows, groups, None))
-    figure = _figure(max(5.0, (0.55 * n + 0.6) * len(parts) + 1.0), 4.6)
+    figure = new_figure(max(5.0, (0.55 * n + 0.6) * len(parts) + 1.0), 4.6)
     axes = figure.subplots(1, len(parts), sharey=True, squeeze=False)[0]
     for ax, part in zip(axes, parts, strict=True):
         for i, bar in enumerate(_series(rows, groups, part)):
@@ -203,7 +205,7 @@ def overlay(found: Sequence[Results], rows: Sequence[Row]) -> Any:
     """Return one panel per policy with all trajectories of a suite whose worlds differ from episode to episode."""
     columns = min(4, len(found))
     lines = math.ceil(len(found) / columns)
-    figure = _figure(2.6 * columns + 0.6, 2.75 * lines + 0.6)
+    figure = new_figure(2.6 * columns + 0.6, 2.75 * lines + 0.6)
     axes = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
     for ax, results in zip(axes.flat, found, strict=False):
         episodes = range(len(results.outcome))
@@ -286,7 +288,7 @@ def grid(results: Results) -> Any:
     suite = results.suite
     columns = 9
     lines = math.ceil(len(suite.scenarios) / columns)
-    figure = _figure(1.75 * columns, 2.0 * lines + 0.7)
+    figure = new_figure(1.75 * columns, 2.0 * lines + 0.7)
     axes = figure.subplots(lines, columns, squeeze=False)
     # one row per map, scenarios in the paper's order
     order = sorted(range(len(suite.scenarios)), key=lambda i: suite.maps.index(suite.scenarios[i].map))
@@ -311,11 +313,19 @@ _NOTE = (
 )
 
 
-def comparison(found: Sequence[Results]) -> Any:
-    """Return the paper's figure: a row per policy, a column for each of four telling scenarios."""
+def comparison(found: Sequence[Results], labels: Sequence[str] | None = None) -> Any:
+    """Return the paper's figure: a row per policy, a column for each of four telling scenarios.
+
+    Parameters
+    ----------
+    found : sequence of Results
+        One per row, of ``navrep27``.
+    labels : sequence of str, optional
+        Of the rows; the policies' names by default.
+    """
     suite = found[0].suite
     names = [s.name for s in suite.scenarios]
-    figure = _figure(2.1 * len(PAPER_SCENARIOS) + 0.6, 2.0 * len(found) + 0.9)
+    figure = new_figure(2.1 * len(PAPER_SCENARIOS) + 0.6, 2.0 * len(found) + 0.9)
     axes = figure.subplots(len(found), len(PAPER_SCENARIOS), squeeze=False)
     for column, name in enumerate(PAPER_SCENARIOS):
         i = names.index(name)
@@ -329,8 +339,8 @@ def comparison(found: Sequence[Results]) -> Any:
             _paths(ax, results, episodes)
             _overlaid(ax, results, episodes, corner=corner)
         axes[0, column].set_title(f"{name}\n({MAP_GROUPS[suite.scenarios[i].map]} map)", fontsize=7.5)
-    for ax, results in zip(axes[:, 0], found, strict=True):
-        ax.set_ylabel(results.name, fontsize=7)
+    for ax, label in zip(axes[:, 0], labels or [r.name for r in found], strict=True):
+        ax.set_ylabel(label, fontsize=7)
     figure.supxlabel(_NOTE, fontsize=6.5)
     _legend(figure)
     return figure

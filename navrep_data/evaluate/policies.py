@@ -128,4 +128,6 @@ def _from_zoo(name: str, source: str | None, inference: str) -> PilotSpec:
             "scans. List them: navrep-data models"
         )
     files = {e.path: e.sha256 or f"git:{e.git_blob_sha1}" for r in registry.with_parts(record) for e in r.files}
-    return PilotSpec(record.name, "scan", record.variant, "zoo", source, inference, files)
+    # our run of a variant is never counted among the authors' runs of it
+    variant = record.name if record.ours else record.variant
+    return PilotSpec(record.name, "scan", variant, "zoo", source, inference, files)

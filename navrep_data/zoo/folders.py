@@ -152,7 +152,7 @@ def load_folder(
     Parameters
     ----------
     path : path-like
-        Policy folder, checkpoint folder, or ``FILE.safetensors`` with its JSON beside it.
+        Policy folder, checkpoint folder, output folder of a training, or ``FILE.safetensors`` with its JSON beside it.
     inference, seed, **options
         As for :func:`navrep_data.zoo.load`.
 
@@ -168,6 +168,10 @@ def load_folder(
         raise ModelNotFoundError(f"There is no {path}, expected a folder with a checkpoint: check the path.")
     if not (path / POLICY_FILE).is_file():
         return _load_checkpoint(path, path.stem if path.is_file() else path.resolve().name, inference, seed, options)
+    if is_training(path):
+        from navrep_data.zoo.local import load_policy
+
+        return load_policy(path, inference=inference, seed=seed, **options)
     found = read_policy(path)
     from navrep_data.zoo.assemble import build
 
@@ -183,6 +187,13 @@ def load_folder(
         "lidar": found["lidar"], "context_rule": found["context"], "sensor": found["sensor"],
     }  # fmt: skip
     return build(record, _files(path / CONTROLLER), parts, inference=inference, seed=seed, **options)
+
+
+def is_training(path: Path) -> bool:
+    """Return whether a folder is a controller's training: its weights lie beside ``policy.json``, not in a folder."""
+    from navrep_data.models.checkpoint import WEIGHTS_NAME
+
+    return (path / POLICY_FILE).is_file() and (path / WEIGHTS_NAME).is_file()
 
 
 def _files(path: Path) -> dict[str, Path]:

@@ -31,7 +31,8 @@ def load_any_model(name: str | os.PathLike[str], source: str | os.PathLike[str] 
     ----------
     name : str or path-like
         Name such as ``transformer_1d.released``, or a folder with ``model.safetensors`` and ``config.json``: a
-        checkpoint of :mod:`navrep_data.models.checkpoint`, or what ``navrep-data train`` wrote.
+        checkpoint of :mod:`navrep_data.models.checkpoint`, what ``navrep-data train`` wrote, or a policy of
+        :func:`navrep_data.zoo.save_policy`.
     source : path-like or str, optional
         Where names are looked for, see :func:`navrep_data.zoo.load`.
     **options
@@ -57,8 +58,12 @@ def load_any_model(name: str | os.PathLike[str], source: str | os.PathLike[str] 
         raise CheckpointError(
             f"There is no {path}; expected a folder with model.safetensors, or a name: navrep-data models"
         )
-    if (path / POLICY_FILE).is_file():
+    from navrep_data.zoo.folders import is_training, load_folder
+
+    if is_training(path):
         return load_policy(path, **options)
+    if (path / POLICY_FILE).is_file():
+        return load_folder(path, **options)
     from navrep_data.models import checkpoint
 
     return checkpoint.load(path)

@@ -173,7 +173,8 @@ def _check(record: Record, where: Source, golden: Path | None) -> Check:
         path, wrong = locate(entry, where)
         if path is None:
             missing.append(asdict(entry))
-            problems.append(f"{entry.path} ({entry.id}) {where.lacks()}")
+            where_not = "is not in this package: reinstall navrep-data" if entry.packaged else where.lacks()
+            problems.append(f"{entry.path} ({entry.id}) {where_not}")
         elif wrong is not None:
             problems.append(f"{path} has {wrong}")
     needs = tuple(dict.fromkeys(part.name for part, _ in missing_here(record, where) if part != record))
@@ -224,6 +225,10 @@ def open_alone(record: Record, path: Path) -> Any:
     module: Any
     if record.format == "sb2-zip":
         module = importers.load_controller_zip(path)
+    elif record.format == "safetensors":
+        from navrep_data.models import checkpoint
+
+        module = checkpoint.load(path)
     elif record.format == "torch-state-dict":
         module = importers.load_torch_world_model(path)
     else:
