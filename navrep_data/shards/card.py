@@ -61,7 +61,7 @@ def _front_matter(m: Manifest) -> str:
         "- reinforcement-learning",
         "- robotics",
         "tags:",
-        *(f"- {tag}" for tag in ("navrep", "robot-navigation", "lidar", "crowd", "orca", "world-models", "hdf5")),
+        *(f"- {tag}" for tag in _tags(m)),
         "size_categories:",
         f"- {_size_category(m.rows)}",
         "configs:",
@@ -71,6 +71,11 @@ def _front_matter(m: Manifest) -> str:
         "---",
     ]
     return "\n".join(lines)
+
+
+def _tags(m: Manifest) -> list[str]:
+    orca = ["orca"] if m.config.get("human_policy", "orca") == "orca" else []
+    return ["navrep", "robot-navigation", "lidar", "crowd", *orca, "world-models", "hdf5"]
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
@@ -148,8 +153,36 @@ def _part(m: Manifest) -> str:
     )
 
 
+def _on_maps(m: Manifest) -> bool:
+    return m.config.get("world") == "map"
+
+
+def _maps(m: Manifest) -> str:
+    """Return the section on the maps of a dataset, with their terms; nothing for worlds that we make ourselves."""
+    if not _on_maps(m):
+        return ""
+    scenarios, maps = m.config.get("scenarios") or (), m.config.get("maps") or ()
+    which = f"those of its {len(scenarios)} scenarios" if scenarios else ", ".join(f"`{name}`" for name in maps)
+    return f"""## Maps
+
+Everything happens on fixed maps: {which}. Those of NavRep's environments come with the Python package
+`asl-pepper-2d-sim` (`pip install navrep-data[maps]`), **which states no licence**. They are not part of this dataset:
+`worlds/` gives each episode's map by name and hash. But scans and pictures show what the lidar saw of them, so the
+licence of this dataset can only cover what was added to the maps.
+
+"""
+
+
+def _humans(m: Manifest) -> str:
+    if not (m.config.get("humans", 1) or m.config.get("scenarios")):
+        return "nobody but robots"
+    ways = {"planned": "walk along planned paths", "static": "stand still", "constant-velocity": "walk straight on"}
+    return f"humans that {ways.get(m.config.get('human_policy', 'orca'), 'follow ORCA')}"
+
+
 def _limits(m: Manifest) -> str:
-    lines = ["* Simulated: flat ground, a planar lidar without noise, humans that follow ORCA."]
+    noise = "with" if m.config.get("scan_noise") or m.config.get("scan_dropout") else "without"
+    lines = [f"* Simulated: flat ground, a planar lidar {noise} noise, {_humans(m)}."]
     if m.scan_dtype == "uint16":
         lines.append(
             "* Scans are rounded to millimetres: about 1 frame in 8 has one rings cell one bin off that of float32."
@@ -218,9 +251,9 @@ anticlockwise; up to {m.sensor.range_max:g} m; one step is {m.sensor.dt:g} s.
 
 {_columns_table(all_layouts)}
 
-`worlds/` holds the obstacles, goals and start states of each episode, one npz per shard.
+`worlds/` holds the {"map" if _on_maps(m) else "obstacles"}, goals and start states of each episode, one npz per shard.
 
-## Outcomes
+{_maps(m)}## Outcomes
 
 {_outcomes_table(m.statistics)}
 

@@ -241,6 +241,38 @@ def test_info_and_card(dataset):
     assert "not made or endorsed by the NavRep authors" in " ".join(card.split())
 
 
+@pytest.mark.parametrize(
+    ("config", "words", "tag"),
+    [
+        ({}, "humans that follow ORCA", True),
+        ({"human_policy": "static"}, "humans that stand still", False),
+        ({"human_policy": "constant-velocity"}, "humans that walk straight on", False),
+        (
+            {"human_policy": "planned", "scenarios": ["a", "b"], "humans": 0},
+            "humans that walk along planned paths",
+            False,
+        ),
+        ({"humans": 0}, "nobody but robots", True),
+        ({"scan_noise": 0.1}, "a planar lidar with noise", True),
+    ],
+)
+def test_card_says_what_was_simulated(dataset, config, words, tag):
+    card = dataset_card(replace(Manifest.read(dataset), config=config))
+    assert words in card
+    assert ("\n- orca\n" in card) == tag
+    assert "## Maps" not in card
+
+
+def test_card_of_a_dataset_on_maps_tells_the_maps_terms(dataset):
+    manifest = Manifest.read(dataset)
+    card = dataset_card(replace(manifest, config={"world": "map", "maps": ["asl", "mine"], "humans": 5}))
+    assert "fixed maps: `asl`, `mine`." in card
+    assert "`asl-pepper-2d-sim` (`pip install navrep-data[maps]`), **which states no licence**" in card
+    assert "`worlds/` holds the map, goals and start states" in card
+    card = dataset_card(replace(manifest, config={"world": "map", "scenarios": ["a", "b"]}))
+    assert "fixed maps: those of its 2 scenarios." in card
+
+
 def test_card_of_a_dataset_without_optional_parts(tmp_path):
     columns = tuple(c for c in ALL_COLUMNS if c not in ("rings", "humans"))
     manifest = make_dataset(tmp_path, 1, 1, 40, worlds=False, scan_dtype="float32", columns=columns)
