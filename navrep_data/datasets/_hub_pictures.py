@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from navrep_data.observations import metres_from_millimetres, scan_to_rings
 from navrep_data.schema import Event
-from navrep_data.shards import DatasetFolder, EpisodeWorld
+from navrep_data.shards import DatasetFolder, Episodes, EpisodeWorld
 from navrep_data.sim.drawing import OBSTACLE, draw_rings, draw_scan, draw_world, scan_points
 
 FRAMES = 36
@@ -110,7 +110,7 @@ def draw_pictures(folder: DatasetFolder) -> dict[str, bytes]:
 
 
 def _choose(folder: DatasetFolder) -> _Episode | None:
-    """Return the longest of the first episodes that reached its goal, or of all if none did."""
+    """Return the longest of the first episodes that reached the goal, else of all; on maps the most crowded."""
     if not set(_NEEDED) <= set(folder.manifest.columns) or folder.manifest.sensor.n_rays < 2:
         return None
     e = folder.episodes
@@ -120,6 +120,10 @@ def _choose(folder: DatasetFolder) -> _Episode | None:
     if not len(candidates):
         return None
     k = int(candidates[np.argmax(e.length[candidates])])
+    if folder.manifest.config.get("world") == "map":
+        # the longest are on ways so long that nobody can be made out: the largest crowd of the first shard
+        candidates = candidates[e.shard[candidates] == e.shard[candidates[0]]]
+        k = int(max(candidates, key=lambda i: (_crowd(folder, e, i), e.length[i])))
     shard, start, stop = int(e.shard[k]), int(e.start[k]), int(e.start[k] + e.length[k])
     worlds = folder.worlds(shard)
     if worlds is None:
@@ -128,6 +132,12 @@ def _choose(folder: DatasetFolder) -> _Episode | None:
     if not np.isfinite(rows["robot_pose"]).all():  # imports do not know it
         return None
     return _Episode(rows, worlds.episode(int(np.flatnonzero(worlds.arrays["row"] == start)[0])), folder)
+
+
+def _crowd(folder: DatasetFolder, episodes: Episodes, k: int) -> int:
+    """Return the number of humans in an episode."""
+    start, shard = int(episodes.start[k]), int(episodes.shard[k])
+    return int(np.isfinite(folder.read("humans", shard, start, start + 1)[0, :, 0]).sum())
 
 
 def _to_world(humans: Array, pose: Array) -> Array:
