@@ -7,7 +7,7 @@ DEMO ?= data/demo
 # test processes; 0 = all tests in one
 JOBS ?= auto
 
-.PHONY: help install demo test check format bench bench-peers test-nojit test-boundscheck coverage kill-test cards wheel clean
+.PHONY: help install demo test check format bench bench-peers test-nojit test-boundscheck coverage kill-test fuzz cards docs wheel clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 20
@@ -53,6 +53,12 @@ coverage: $(STAMP)  ## Line coverage of sim and observations, measured on plain 
 kill-test: $(STAMP)  ## 200 random SIGKILLs of generate (CI runs 10).
 	NAVREP_DATA_KILLS=200 $(BIN)/python -m pytest -m slow tests/generate/test_kill.py -s
 
+# seconds in all; FUZZ_ARGS="--only shard map" for some readers, --seed N to see a finding again
+SECONDS ?= 600
+
+fuzz: $(STAMP)  ## Fuzz every reader of files from outside for SECONDS=600 (CI: 60).
+	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(FUZZ_ARGS)
+
 BENCHMARKS := run zoo envs
 
 bench: $(STAMP)  ## Measure speed and size; writes benchmarks/RESULTS.md.
@@ -67,9 +73,13 @@ PUBLISHED ?= data/published
 cards: $(STAMP)  ## Generate the datasets that we publish; writes their cards and pictures into cards/datasets.
 	$(BIN)/python -m navrep_data.datasets.cards cards/datasets --data $(PUBLISHED)
 
+docs: $(STAMP)  ## Build the documentation site into site/; any warning is an error.
+	rm -rf site
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --fresh-env -d build/doctrees -b html docs site
+
 wheel: $(STAMP)  ## Build the wheel into dist/.
 	rm -rf dist
 	$(BIN)/python -m build --wheel --outdir dist .
 
 clean:  ## Remove the virtual environment and everything built.
-	rm -rf $(VENV) dist build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .coverage*
+	rm -rf $(VENV) dist build site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .coverage*

@@ -81,3 +81,16 @@ def test_several_robots(tmp_path):
     assert out.count("after") == 2
     with Image.open(tmp_path / "r.gif") as film:
         assert film.n_frames > 3
+
+
+@pytest.mark.slow
+def test_drive(tmp_path):
+    import torch
+
+    from navrep_data.models import checkpoint
+
+    torch.manual_seed(0)
+    checkpoint.save(checkpoint.make("e2e", {"lidar": "1d"}), tmp_path / "mine")
+    out = run("drive.py", "--policy", tmp_path / "mine", "--max-steps", 4, "--out", tmp_path / "d.gif")
+    assert Image.open(tmp_path / "d.gif").n_frames >= 4
+    assert "d.gif" in out

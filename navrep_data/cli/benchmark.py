@@ -16,7 +16,7 @@ def benchmark_command(
         list[str] | None,
         typer.Argument(
             metavar="NAME...",
-            help="Baselines goal, random, orca, dwa; networks (navrep-data models); your own module:function.",
+            help="Baselines goal, random, orca, dwa; networks (navrep-data models); your ./folder or module:function.",
         ),
     ] = None,
     suite: Annotated[

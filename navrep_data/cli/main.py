@@ -11,6 +11,7 @@ import typer
 from navrep_data._version import __version__
 from navrep_data.cli import (
     benchmark,
+    doctor,
     encode,
     evaluate,
     generate,
@@ -19,6 +20,8 @@ from navrep_data.cli import (
     info,
     models,
     play,
+    reproduce,
+    tools,
     train,
     verify,
     view,
@@ -38,7 +41,15 @@ app.command("generate")(generate.generate_command)
 app.command("benchmark")(benchmark.benchmark_command)
 app.command("info")(info.info_command)
 app.command("verify")(verify.verify_command)
+app.command("doctor")(doctor.doctor_command)
 app.command("import-npz")(import_npz.import_npz_command)
+app.command("import-rosbag")(tools.import_rosbag_command)
+app.command("merge")(tools.merge_command)
+app.command("split")(tools.split_command)
+app.command("filter")(tools.filter_command)
+app.command("stats")(tools.stats_command)
+app.command("sample")(tools.sample_command)
+app.command("export")(tools.export_command)
 app.command("play")(play.play_command)
 app.command("push")(hub.push_command)
 app.command("pull")(hub.pull_command)
@@ -48,6 +59,7 @@ app.add_typer(models.models_app, name="models")
 app.command("encode")(encode.encode_command)
 app.add_typer(train.train_app, name="train")
 app.add_typer(evaluate.evaluate_app, name="evaluate")
+app.command("reproduce")(reproduce.reproduce_command)
 
 # Newer typers carry their own click; these are the classes that the installed one raises, whichever that is.
 _UsageError: type[Any] = typer.BadParameter.__mro__[1]

@@ -38,7 +38,7 @@ class _VerbOrPattern(typer.core.TyperGroup):
 
 models_app = typer.Typer(
     cls=_VerbOrPattern,
-    help="List the checkpoints that NavRep released ([PATTERN], --json), or show, fetch, verify, convert them.",
+    help="List checkpoints, the released ones and our own ([PATTERN], --json), or show, fetch, verify, convert them.",
     subcommand_metavar="[PATTERN] | VERB [ARGS]...",
 )
 
@@ -49,6 +49,7 @@ def list_command(
 ) -> None:
     """List checkpoints: name, kind, what it reads, whether it is on this machine."""
     from navrep_data.zoo.fetching import Source, missing_here
+    from navrep_data.zoo.names import default_tag
     from navrep_data.zoo.registry import find, list_models
 
     where = Source.of(None)
@@ -64,6 +65,8 @@ def list_command(
     for name, r in chosen.items():
         marks = "yes" if not absent[name] else f"no ({len(absent[name])} to fetch)"
         star = f"  = {r.variant}.released" if r.released and r.tag != "released" else ""
+        if r.ours:
+            star = f"  = {r.variant}, ours" if default_tag(r.variant) == r.tag else "  ours"
         say(
             f"{name:{width}}  {r.kind:11}  {_dash(r.z_size):>3}  {_dash(r.h_size):>3}  {_dash(r.n_inputs):>6}  "
             f"{marks}{star}"

@@ -277,10 +277,14 @@ def _train_controller(
     model: Any, name: str, init: str | None, resume: bool, stop_after: int | None, device: str, source: str | None,
     as_json: bool,
 ) -> None:  # fmt: skip
+    from navrep_data.models import ModularWorldModel
     from navrep_data.train import default_controller_recipe, original_controller_recipe, train_controller
     from navrep_data.zoo.local import load_any_model
 
-    recipe = (original_controller_recipe if original else default_controller_recipe)(features, lidar)
+    if original:
+        recipe = original_controller_recipe(features, lidar, modular=isinstance(model, ModularWorldModel))
+    else:
+        recipe = default_controller_recipe(features, lidar)
     recipe = recipe.replace(**changes).replace(**parse_settings(recipe.to_dict(), settings))
     start = None if init is None else load_any_model(init, source)
     done = train_controller(

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from navrep_data.cli._common import print_json, say, show_progress
+from navrep_data.cli._common import print_json, progress_bar, say
 
 
 def verify_command(
@@ -18,17 +18,10 @@ def verify_command(
     seed: Annotated[int | None, typer.Option("--seed", help="Which sequences.", show_default="random")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Check every file of a dataset: hashes, schema, index, ranges, rings. Exits 1 if anything is wrong."""
-    from tqdm import tqdm
-
+    """Check every file of a dataset: hashes, schema, index, ranges, rings. Exits 2 if anything is wrong."""
     from navrep_data.shards import verify
 
-    with tqdm(unit="shard", disable=not show_progress()) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with progress_bar("shard") as show:
         report = verify(root, progress=show)
     again = None
     if regenerate is not None and report.ok:
@@ -46,4 +39,4 @@ def verify_command(
             detail = f" ({c.values:,} values differ, by at most {c.largest:.3g})" if c.values else ""
             say(f"sequence {c.sequence} made again: {c.verdict}{detail}")
     if not report.ok or (again is not None and not again.ok):
-        raise typer.Exit(1)
+        raise typer.Exit(2)

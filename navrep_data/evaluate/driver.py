@@ -22,6 +22,8 @@ PHYSICS = ("original", "consistent")
 SAVE_SECONDS = 2.0
 """The results file is written this often at most while episodes finish."""
 MAX_WORKERS = 1024
+NETWORKS = ("zoo", "folder")
+"""Kinds of policies for which `inference` means something."""
 
 Progress = Callable[[str, int, int], None]
 """Called with a policy's name, how many of its episodes are finished, and of how many."""
@@ -34,7 +36,7 @@ class Benchmark:
     Attributes
     ----------
     rows : list of dict
-        One per policy, in the order asked for; see :func:`navrep_data.evaluate.scores.summary`.
+        One per policy, in the order asked for; see :func:`navrep_data.evaluate.summary`.
     variants : list of dict
         Variants of which several runs were played.
     baseline : dict
@@ -84,7 +86,8 @@ def benchmark(
     Parameters
     ----------
     policies : sequence of str or callable
-        Baselines (``goal``, ``random``, ``orca``, ``dwa``), names of the zoo, ``module:function``, or callables
+        Baselines (``goal``, ``random``, ``orca``, ``dwa``), names of the zoo, folders of policies (``./folder``,
+        ``hf://user/name``), ``module:function``, or callables
         ``(scan (64, 1080), robot_state (64, 5)) -> action (64, 2 or 3)`` in [-1, 1]. `goal` is always played.
     suite : str
         ``"navreptest"`` or ``"navrep27"``.
@@ -105,7 +108,7 @@ def benchmark(
     batch : int, optional
         Worlds per process; numbers do not depend on it.
     progress : callable, optional
-        See :data:`Progress`.
+        Called with a policy's name, how many of its episodes are finished, and of how many.
 
     Returns
     -------
@@ -125,7 +128,7 @@ def benchmark(
     specs = list(
         {s.name: s for s in (resolve_policy(p, source, inference, bool(chosen.maps)) for p in policies)}.values()
     )
-    specs = [s if s.kind == "zoo" else _plain(s) for s in specs]
+    specs = [s if s.kind in NETWORKS else _plain(s) for s in specs]
     everybody = specs if any(s.name == "goal" for s in specs) else [resolve_policy("goal"), *specs]
     folder = Path(out) / f"{chosen.name}-{kind}"
     try:
@@ -176,7 +179,7 @@ def _play(
     todo = results.missing(total)
     if not todo:
         return False
-    job = Job(suite.name, physics, spec, tuple(todo), spec.inference == "as_released" and spec.kind == "zoo", batch)
+    job = Job(suite.name, physics, spec, tuple(todo), spec.inference == "as_released" and spec.kind in NETWORKS, batch)
     done, saved = total - len(todo), time.monotonic()
     try:
         for finished in run(job, workers):

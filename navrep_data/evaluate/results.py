@@ -44,7 +44,7 @@ class Results:
     Attributes
     ----------
     outcome : list of str
-        A letter per episode, see :data:`LETTERS`.
+        A letter per episode: S goal, T timeout, C any collision, - not played.
     events : list of str
         Name of the event per episode, empty where it was not played.
     steps : list of int
@@ -149,9 +149,10 @@ class Results:
                 raise ValueError(f"format {value['format']!r} version {value['version']!r}")
             results = cls({key: value[key] for key in ("name", "sees", "variant", "settings", "versions")})
             results._read(value)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            said = " ".join(str(error).split())[:120]
             raise CorruptDataError(
-                f"{path} is not a results file of this version ({type(error).__name__}: {error}). Expected one written "
+                f"{path} is not a results file of this version ({type(error).__name__}: {said}). Expected one written "
                 "by navrep-data benchmark; run it again with another --out."
             ) from error
         return results
@@ -166,6 +167,8 @@ class Results:
         lengths = {len(self.events), len(self.steps), *map(len, self.metrics.values())}
         if lengths != {n}:
             raise ValueError("columns of different lengths")
+        if not all(isinstance(value["settings"][key], str) for key in ("suite", "physics", "inference")):
+            raise TypeError("settings that are no text")
         self.trajectories = {
             int(k): np.asarray(xy, np.float64).reshape(-1, 2) / 100.0 for k, xy in value["trajectories_cm"].items()
         }
@@ -239,5 +242,6 @@ def _short(value: Any) -> str:
 
 def file_name(spec: PilotSpec) -> str:
     """Return the name of a policy's results file."""
-    plain = "".join(c if c.isalnum() or c in "._-" else "-" for c in spec.name)
+    # a folder's name may begin with dots, and files that do are hidden
+    plain = "".join(c if c.isalnum() or c in "._-" else "-" for c in spec.name).lstrip(".-") or "policy"
     return f"{plain}.{spec.inference}.json" if spec.inference != "deterministic" else f"{plain}.json"

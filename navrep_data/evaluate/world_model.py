@@ -11,7 +11,7 @@ paper does not say its unit. The released software took a modular model's predic
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ from torch import Tensor
 
 from navrep_data.datasets import SequenceDataset
 from navrep_data.errors import ConfigError, DatasetMismatchError
+from navrep_data.models.vae import VAE
 from navrep_data.models.world_model import WorldModel
 from navrep_data.schema import SensorContract
 from navrep_data.shards import DatasetFolder
@@ -44,8 +45,9 @@ class WorldModelError:
         Representation that the errors are in: values {0, 0.5, 1}, or ranges over 25 m.
     rows : int
         Predicted rows.
-    scan_mse, goal_mse : float
-        World-model error, teacher-forced: each row predicted from the real rows before it. goal_mse in m^2.
+    scan_mse, goal_mse : float or None
+        World-model error, teacher-forced: each row predicted from the real rows before it. goal_mse in m^2. None for a
+        V alone, which predicts nothing; so are the dreams' then.
     reconstruction_mse : float
         Error of V itself, on the rows that predictions start from.
     still_scan_mse, still_goal_mse : float
@@ -64,8 +66,8 @@ class WorldModelError:
     split: str
     lidar: str
     rows: int
-    scan_mse: float
-    goal_mse: float
+    scan_mse: float | None
+    goal_mse: float | None
     reconstruction_mse: float
     still_scan_mse: float
     still_goal_mse: float
@@ -82,7 +84,7 @@ class WorldModelError:
 
 
 def world_model_error(
-    model: WorldModel,
+    model: WorldModel | VAE,
     data: Path | str,
     *,
     split: Literal["train", "val", "test"] = "train",
@@ -95,8 +97,8 @@ def world_model_error(
 
     Parameters
     ----------
-    model : WorldModel
-        Modular, joint or transformer.
+    model : WorldModel or VAE
+        Modular, joint or transformer; of a V alone, its reconstruction error.
     data : path-like
         Dataset folder.
     split : {"train", "val", "test"}
@@ -127,6 +129,8 @@ def world_model_error(
     own codes and goals and the actions that were really taken. Everything is deterministic: z is the mean, there is no
     dropout.
     """
+    if isinstance(model, VAE):
+        return _of_v(model, Path(data), split, limit, name, progress)
     if not isinstance(model, WorldModel):
         raise ConfigError(
             f"{name or 'This'} is a {type(model).__name__}, expected a world model such as transformer_1d."
@@ -135,21 +139,37 @@ def world_model_error(
     if type(steps) is not int or not 1 <= steps <= window - 1:
         raise ConfigError(f"steps is {steps!r}, expected 1 to {window - 1}: dream and context share {window} rows.")
     context = min(CONTEXT, window - steps + 1)
-    dataset = _open(model, Path(data), split, window)
-    chosen = np.arange(len(dataset))
-    if limit is not None:
-        if limit < 1:
-            raise ConfigError(f"limit is {limit}, expected at least 1 window.")
-        chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, min(limit, len(chosen))).astype(int))]
+    dataset = _open(model.lidar, model.config.action_alignment, Path(data), split, window)
     sums = _Sums(steps)
-    for batch in _batches(model, dataset, chosen, progress):
+    for batch in _batches(model.vae, dataset, _chosen(dataset, limit), progress):
         _teacher_forced(model, batch, sums)
         _dreams(model, batch, context, steps, sums)
     dataset.close()
     return sums.result(name, split, model.lidar, context)
 
 
-def _open(model: WorldModel, data: Path, split: Any, window: int) -> SequenceDataset:
+def _of_v(
+    model: VAE, data: Path, split: Literal["train", "val", "test"], limit: int | None, name: str, progress: bool
+) -> WorldModelError:
+    """Return the reconstruction error of a V, over the rows that a world model's is taken of."""
+    dataset = _open(model.config.lidar, "taken", data, split, 32)
+    sums = _Sums(0)
+    for batch in _batches(model, dataset, _chosen(dataset, limit), progress):
+        _still_and_reconstructed(model, batch, model.encode(batch["obs"][:, :-1]).detach(), sums)
+    dataset.close()
+    found = sums.result(name, split, model.config.lidar, 0)
+    return replace(found, scan_mse=None, goal_mse=None)
+
+
+def _chosen(dataset: SequenceDataset, limit: int | None) -> np.ndarray[Any, Any]:
+    """Return the windows to look at, evenly spread."""
+    if limit is not None and limit < 1:
+        raise ConfigError(f"limit is {limit}, expected at least 1 window.")
+    n = len(dataset)
+    return np.arange(n) if limit is None else np.unique(np.linspace(0, n - 1, min(limit, n)).astype(int))
+
+
+def _open(lidar: Any, alignment: Any, data: Path, split: Any, window: int) -> SequenceDataset:
     folder = DatasetFolder(data)
     sensor, expected = folder.manifest.sensor, SensorContract()
     folder.close()
@@ -159,8 +179,6 @@ def _open(model: WorldModel, data: Path, split: Any, window: int) -> SequenceDat
             raise DatasetMismatchError(
                 f"{data} has scans with {key} = {seen}, expected {value}: the model takes this sensor only."
             )
-    lidar: Any = model.lidar
-    alignment: Any = model.config.action_alignment
     return SequenceDataset(
         data, lidar, window=window + 1, stride=window, split=split, fields=["robot_state", "action", "goal_valid"],
         action=alignment, scan_unit="normalized", invalid="range_max",
@@ -168,12 +186,12 @@ def _open(model: WorldModel, data: Path, split: Any, window: int) -> SequenceDat
 
 
 def _batches(
-    model: WorldModel, dataset: SequenceDataset, chosen: np.ndarray[Any, Any], progress: bool
+    vae: VAE, dataset: SequenceDataset, chosen: np.ndarray[Any, Any], progress: bool
 ) -> Iterator[dict[str, Tensor]]:
     from tqdm import tqdm
 
-    field = "rings" if model.lidar == "rings" else "scan"
-    device = model.device_of()
+    field = "rings" if vae.config.lidar == "rings" else "scan"
+    device = vae.fc1.weight.device
     for first in tqdm(range(0, len(chosen), _BATCH), unit="batch", disable=not progress):
         raw = dataset.batch(chosen[first : first + _BATCH])
         obs = raw[field]
@@ -216,19 +234,26 @@ def _row_errors(a: Tensor, b: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _teacher_forced(model: WorldModel, batch: dict[str, Tensor], sums: _Sums) -> None:
-    obs, goal, mask = batch["obs"], batch["goal"], batch["mask"]
-    now, after = obs[:, :-1], obs[:, 1:]
-    target = mask[:, 1:]
-    out = model.forward(now, goal[:, :-1], batch["action"][:, :-1])
+def _still_and_reconstructed(vae: VAE, batch: dict[str, Tensor], mu: Tensor, sums: _Sums) -> Tensor:
+    """Add what needs no memory, given the codes of all rows but the last; return which pairs have a known goal."""
+    obs, goal = batch["obs"], batch["goal"]
+    now, after, target = obs[:, :-1], obs[:, 1:], batch["mask"][:, 1:]
     sums.rows += float(target.sum())
-    sums.forced["scan"] += float(_row_errors(model.decode(out.next_z[target]), after[target]).sum())
-    sums.forced["rec"] += float(_row_errors(model.decode(out.mu[target]), now[target]).sum())
+    sums.forced["rec"] += float(_row_errors(vae.decode(mu[target]), now[target]).sum())
     sums.forced["still_scan"] += float(_row_errors(now[target], after[target]).sum())
     known = batch["goal_mask"][:, 1:] & batch["goal_mask"][:, :-1]
     sums.goal_rows += float(known.sum())
-    sums.forced["goal"] += float(_row_errors(out.next_goal[known], goal[:, 1:][known]).sum())
     sums.forced["still_goal"] += float(_row_errors(goal[:, :-1][known], goal[:, 1:][known]).sum())
+    return known
+
+
+@torch.no_grad()
+def _teacher_forced(model: WorldModel, batch: dict[str, Tensor], sums: _Sums) -> None:
+    obs, goal, target = batch["obs"], batch["goal"], batch["mask"][:, 1:]
+    out = model.forward(obs[:, :-1], goal[:, :-1], batch["action"][:, :-1])
+    sums.forced["scan"] += float(_row_errors(model.decode(out.next_z[target]), obs[:, 1:][target]).sum())
+    known = _still_and_reconstructed(model.vae, batch, out.mu, sums)
+    sums.forced["goal"] += float(_row_errors(out.next_goal[known], goal[:, 1:][known]).sum())
 
 
 @torch.no_grad()
@@ -281,63 +306,3 @@ def _dreams(model: WorldModel, batch: dict[str, Tensor], context: int, steps: in
         sums.dream["still_scan"][k] += float(_row_errors(last_obs[at, k], real[at, k]).sum())
         sums.dream["goal"][k] += float(_row_errors(goal[there, k], real_goal[there, k]).sum())
         sums.dream["still_goal"][k] += float(_row_errors(last_goal[there, k], real_goal[there, k]).sum())
-
-
-# Longer labels would leave the axes of a figure no room.
-LABEL_LENGTH = 28
-
-
-def table(results: list[WorldModelError]) -> list[str]:
-    """Return lines for people: one model per line, errors of lidar and goal apart."""
-    width = max([len(r.name) for r in results] + [5])
-    k = len(results[0].dream_scan_mse)
-    dreamed = f"dream {k}"
-    lines = [f"{'model':{width}}  lidar  {'scan':>9} {'goal m2':>9}  {'V alone':>9}  {dreamed:>9} {'goal m2':>9}  rows"]
-    for r in results:
-        lines.append(
-            f"{r.name:{width}}  {r.lidar:5}  {r.scan_mse:9.5f} {r.goal_mse:9.5f}  {r.reconstruction_mse:9.5f}  "
-            f"{r.dream_scan_mse[-1]:9.5f} {r.dream_goal_mse[-1]:9.5f}  {r.rows:,}"
-        )
-        lines.append(
-            f"{'(standing still)':{width}}  {'':5}  {r.still_scan_mse:9.5f} {r.still_goal_mse:9.5f}  {'':9}  "
-            f"{r.dream_still_scan_mse[-1]:9.5f} {r.dream_still_goal_mse[-1]:9.5f}"
-        )
-    return lines
-
-
-def _short(name: str) -> str:
-    """Return a name, perhaps a path, that fits under a bar."""
-    return name if len(name) <= LABEL_LENGTH else f"...{name[3 - LABEL_LENGTH :]}"
-
-
-def figure(results: list[WorldModelError], path: Path | str) -> None:
-    """Draw the errors of the next step as bars and those of the dream as curves, lidar and goal apart."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    picture = Figure(figsize=(9.0, 6.0), dpi=120, layout="constrained")
-    canvas = FigureCanvasAgg(picture)
-    axes = picture.subplots(2, 2)
-    picture.suptitle(f"World-model error, {results[0].split} split", fontsize=11)
-    units = {"rings": "MSE of rings", "1d": "MSE of ranges / 25 m"}
-    what = units[results[0].lidar] if len({r.lidar for r in results}) == 1 else "MSE"
-    for j, (kind, label) in enumerate((("scan", what), ("goal", "MSE of the goal [m$^2$]"))):
-        names = [_short(r.name) for r in results]
-        bars, curves = axes[0, j], axes[1, j]
-        bars.bar(names, [getattr(r, f"{kind}_mse") for r in results], color="#1f4e79", label="model")
-        still = [getattr(r, f"still_{kind}_mse") for r in results]
-        bars.scatter(names, still, color="#c0504d", marker="_", s=400, label="standing still")
-        bars.set_ylabel(label)
-        bars.set_title("next step" if j == 0 else "next step, goal", fontsize=9)
-        bars.tick_params(axis="x", labelsize=8)
-        bars.legend(fontsize=7)
-        for r in results:
-            values = getattr(r, f"dream_{kind}_mse")
-            curves.plot(range(1, len(values) + 1), values, marker=".", label=_short(r.name))
-        first = getattr(results[0], f"dream_still_{kind}_mse")
-        curves.plot(range(1, len(first) + 1), first, "--", color="#888888", label="standing still")
-        curves.set_xlabel("steps dreamed (0.2 s each)")
-        curves.set_ylabel(label)
-        curves.set_ylim(bottom=0)
-        curves.legend(fontsize=7)
-    canvas.print_png(str(path))  # type: ignore[no-untyped-call]

@@ -36,6 +36,8 @@ from navrep_data.models.vae import VAE
 DATASET_FIELDS = ("name", "repo", "revision", "content_hash")
 """What the record of a dataset holds at least: its name, Hub repository and commit (or None), hash over its rows."""
 FORMAT_NAME = "navrep-data-model"
+STORAGE = {"float32": torch.float32, "float16": torch.float16}
+"""How weights may be stored; networks always hold float32. Half the bytes cost about three decimals."""
 FORMAT_VERSION = 1
 WEIGHTS_NAME, CONFIG_NAME = "model.safetensors", "config.json"
 # Configs hold a few settings and notes; weights carry a header beside the numbers.
@@ -94,6 +96,7 @@ def save(
     metadata: Mapping[str, Any] | None = None,
     *,
     dataset: Mapping[str, Any] | None = None,
+    storage: str = "float32",
 ) -> Path:
     """Write a network as safetensors and JSON; the config comes last, so a checkpoint with one is complete.
 
@@ -109,6 +112,8 @@ def save(
         What it was trained on, kept as ``metadata["dataset"]``: the ``provenance`` of a dataset of
         :mod:`navrep_data.datasets`, or :func:`navrep_data.shards.dataset_record` of a folder, with more keys (split) if
         you like. It says which rows, by content hash, and where they came from, by repository and commit.
+    storage : str
+        ``"float32"``, or ``"float16"``: half the bytes, rounded.
 
     Returns
     -------
@@ -120,8 +125,10 @@ def save(
     CheckpointError
         If the module is not a network of this package or holds NaN or infinity.
     ConfigError
-        If `dataset` lacks what identifies a dataset.
+        If `dataset` lacks what identifies a dataset, or `storage` is unknown.
     """
+    if storage not in STORAGE:
+        raise ConfigError(f"storage is {storage!r}, expected one of: {', '.join(STORAGE)}.")
     kept = dict(metadata or {})
     if dataset is not None:
         missing = [name for name in DATASET_FIELDS if name not in dataset]
@@ -136,8 +143,9 @@ def save(
         raise CheckpointError(
             f"A {type(module).__name__} cannot be saved, expected a network of navrep_data.models: {', '.join(KINDS)}."
         )
-    state = {name: t.detach().to("cpu", torch.float32).contiguous() for name, t in module.state_dict().items()}
-    _check_finite(state, "The network")
+    state = {name: t.detach().to("cpu", STORAGE[storage]).contiguous() for name, t in module.state_dict().items()}
+    # float16 ends at 65504: what is larger would be infinite
+    _check_finite(state, "The network" if storage == "float32" else f"The network in {storage}")
     weights_path, config_path = paths(path)
     weights_path.parent.mkdir(parents=True, exist_ok=True)
     weights = safetensors.torch.save(state)
@@ -150,6 +158,8 @@ def save(
             "kind": config.kind,
             "config": config.to_dict(),
             "weights_sha256": sha256_bytes(weights),
+            # said only where it is not the usual one, so that older configs keep their bytes
+            **({} if storage == "float32" else {"weights_dtype": storage}),
             "metadata": kept,
         },
     )
@@ -198,13 +208,15 @@ def load(path: Path | str) -> nn.Module:
     """
     found = read_config(path)
     weights_path, config_path = paths(path)
-    kind = found.get("kind")
+    kind, storage = found.get("kind"), found.get("weights_dtype", "float32")
     settings = found.get("config", {})
+    if not isinstance(storage, str) or storage not in STORAGE:
+        raise CheckpointError(f"{config_path}: weights_dtype is {str(storage)[:40]!r}, expected {', '.join(STORAGE)}.")
     module = make(str(kind), settings)
     expected = module.state_dict()
     if not weights_path.is_file():
         raise CheckpointError(f"There is no {weights_path} beside {config_path.name}; get the checkpoint again.")
-    limit = sum(t.numel() * 4 for t in expected.values()) + _MAX_HEADER_BYTES
+    limit = sum(t.numel() for t in expected.values()) * STORAGE[storage].itemsize + _MAX_HEADER_BYTES
     size = weights_path.stat().st_size
     if not limit - _MAX_HEADER_BYTES < size <= limit:
         raise CheckpointError(
@@ -220,7 +232,10 @@ def load(path: Path | str) -> nn.Module:
         state = safetensors.torch.load(data)
     except safetensors.SafetensorError as error:
         raise CheckpointError(f"{weights_path} is not a safetensors file ({error}); get it again.") from error
-    put_weights(module, state, str(weights_path))
+    for name, value in state.items():
+        if value.dtype != STORAGE[storage]:
+            raise CheckpointError(f"{weights_path}: {name[:80]!r} is {value.dtype}, expected {storage}; get it again.")
+    put_weights(module, {name: value.to(torch.float32) for name, value in state.items()}, str(weights_path))
     return module
 
 

@@ -375,6 +375,23 @@ class Simulator:
         fewer: NDArray[np.int64] = self.arrays.scalars[:, [lay.S_FEWER_HUMANS, lay.S_FEWER_OBSTACLES]].astype(np.int64)
         return most - fewer
 
+    def set_difficulty(self, difficulty: ArrayLike) -> None:
+        """Set what :meth:`difficulty` returns, for the episodes that start from now on.
+
+        Raises
+        ------
+        SimulationError
+            If it is not (W, 2) whole numbers from 0 up to the config's `humans` and `obstacles`.
+        """
+        most = np.array([self.config.humans, self.config.obstacles])
+        given = np.asarray(difficulty)
+        if given.shape != (self.n_worlds, 2) or (given != np.clip(np.rint(given), 0, most)).any():
+            raise SimulationError(
+                f"difficulty has shape {given.shape}, expected ({self.n_worlds}, 2) whole numbers from 0 to "
+                f"{most.tolist()}: what difficulty() returns."
+            )
+        self.arrays.scalars[:, [lay.S_FEWER_HUMANS, lay.S_FEWER_OBSTACLES]] = most - given
+
     def clearance(self, points: ArrayLike, world: int = 0) -> F64:
         """Return how far points (N, 2) are from solid static matter [m], world frame; negative inside it.
 

@@ -10,17 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.policies import ActorCriticPolicy
-from torch import nn
 
 from navrep_data._version import __version__
-from navrep_data.errors import CheckpointError, ConfigError, TrainingError
-from navrep_data.io import atomic_write_json, read_json
-from navrep_data.models import Controller, ControllerConfig, EndToEnd, EndToEndConfig, checkpoint
-from navrep_data.models.world_model import WorldModel
-from navrep_data.schema import ROBOT_STATE_SIZE, Event, SensorContract
+from navrep_data.errors import TrainingError
+from navrep_data.io import atomic_write_json
+from navrep_data.models import Controller, EndToEnd, checkpoint
+from navrep_data.schema import Event, SensorContract
 from navrep_data.shards import writer_lock
 from navrep_data.train import state
 from navrep_data.train.controller_recipe import (
@@ -31,96 +27,16 @@ from navrep_data.train.controller_recipe import (
     environment,
     validation_environment,
 )
-from navrep_data.train.encode import vae_of, weights_hash
+from navrep_data.train.encode import weights_hash
+from navrep_data.train.learner import make_network, make_policy, make_ppo, network_of, scale_inputs
 from navrep_data.train.logs import Logger, curve
-from navrep_data.train.ppo_policy import BoundedPolicy
+from navrep_data.train.world_models import claim, machine
 from navrep_data.train.worlds import TrainingWorlds, play
 from navrep_data.zoo.local import PARTS, POLICY_FILE
 from navrep_data.zoo.policy import Policy
-from navrep_data.zoo.sb3 import EndToEndExtractor, put_weights, take_weights
+from navrep_data.zoo.sb3 import put_weights, take_weights
 
-_MAX_JSON = 1 << 20
-_GOAL_COLUMNS = 2
 _LEAST_RATE = 0.02
-
-
-def make_network(recipe: ControllerRecipe, model: Any) -> Controller | EndToEnd:
-    """Return a new controller for a recipe and a world model (or V).
-
-    Raises
-    ------
-    ConfigError
-        If the model lacks what the features need, or is for another lidar.
-    """
-    squash = "clip" if recipe.original else "tanh"
-    if recipe.features == "e2e":
-        return EndToEnd(EndToEndConfig(recipe.lidar, n_hidden=recipe.hidden, squash=squash, max_speed=recipe.max_speed))
-    vae = vae_of(model, "The world model")
-    if vae.config.lidar != recipe.lidar:
-        raise ConfigError(f"The world model reads {vae.config.lidar}, expected {recipe.lidar}: set --lidar to match.")
-    n = ROBOT_STATE_SIZE + (vae.config.z_size if "z" in recipe.features else 0)
-    if "h" in recipe.features:
-        if not isinstance(model, WorldModel):
-            raise ConfigError(
-                f"Features {recipe.features} need a memory, expected a world model, not a {type(model).__name__}: "
-                "take --features z, or name a joint, transformer or modular model."
-            )
-        n += model.h_size
-    network = Controller(ControllerConfig(n, recipe.hidden, squash, recipe.max_speed))
-    if not recipe.original:
-        _scale_inputs(network, vae.config.z_size if "z" in recipe.features else 0)
-    return network
-
-
-@torch.no_grad()
-def _scale_inputs(network: Controller, n_before: int) -> None:
-    """Start with small weights for the goal, which comes in metres, up to 18."""
-    for perceptron in (network.pi, network.vf):
-        first = perceptron[0]
-        assert isinstance(first, nn.Linear)
-        first.weight[:, n_before : n_before + _GOAL_COLUMNS] *= 0.1
-
-
-def make_policy(recipe: ControllerRecipe, network: Controller | EndToEnd, model: Any, name: str = "") -> Policy:
-    """Return the policy that a controller makes with its world model.
-
-    Raises
-    ------
-    CheckpointError, ConfigError
-        If they do not fit.
-    """
-    if recipe.features == "e2e":
-        return Policy(network, None, recipe.lidar, name=name, dtype=recipe.precision)
-    world_model = model if isinstance(model, WorldModel) and "h" in recipe.features else None
-    context = None if world_model is None or world_model.default_context == "carried-state" else recipe.context
-    return Policy(
-        network, recipe.features, recipe.lidar, vae_of(model, name), world_model, name=name, context=context,
-        dtype=recipe.precision,
-    )  # fmt: skip
-
-
-def make_ppo(recipe: ControllerRecipe, worlds: TrainingWorlds, network: Controller | EndToEnd, device: str) -> PPO:
-    """Return the learner, with the network's weights."""
-    kwargs: dict[str, Any] = {
-        "net_arch": {"pi": [network.config.n_hidden] * 2, "vf": [network.config.n_hidden] * 2},
-        "activation_fn": nn.Tanh,
-        "optimizer_kwargs": {"eps": 1e-5},
-    }
-    if isinstance(network, EndToEnd):
-        kwargs |= {
-            "activation_fn": nn.ReLU,
-            "features_extractor_class": EndToEndExtractor,
-            "features_extractor_kwargs": {"lidar": recipe.lidar},
-        }
-    kind = ActorCriticPolicy if network.config.squash == "clip" else BoundedPolicy
-    return PPO(
-        kind, worlds, learning_rate=recipe.lr, n_steps=recipe.rollout, batch_size=recipe.batch, n_epochs=recipe.epochs,
-        gamma=recipe.gamma, gae_lambda=recipe.gae_lambda, clip_range=recipe.clip_range,
-        clip_range_vf=recipe.clip_range if recipe.original else None, ent_coef=recipe.entropy,
-        vf_coef=recipe.value_weight, max_grad_norm=recipe.max_grad_norm,
-        target_kl=recipe.target_kl if recipe.target_kl > 0 else None, policy_kwargs=kwargs, seed=recipe.seed,
-        device=device,
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -176,7 +92,8 @@ def train_controller(
     init : Policy, optional
         Go on from this policy's controller; its own bounds and sizes are kept.
     resume : bool
-        Go on from the last checkpoint in `out`; the worlds start anew, from another stream of the same seed.
+        Go on from the last checkpoint in `out`, to the same weights as without the interruption: at every checkpoint
+        all worlds start anew, as difficult as they were.
     stop_after : int, optional
         Stop, with a checkpoint, after this many steps.
     device : str
@@ -199,10 +116,8 @@ def train_controller(
     """
     out = Path(out)
     torch.manual_seed(recipe.seed)
-    network = make_network(recipe, model) if init is None else _network_of(init, recipe, model)
+    network = make_network(recipe, model) if init is None else network_of(init, recipe, model)
     used = None if recipe.features == "e2e" else weights_hash(model)
-    from navrep_data.train.world_models import claim
-
     claim(
         out, recipe.to_dict(), {"world_model": model_name, "world_model_sha256": used}, resume, free=("validate_every",)
     )
@@ -211,28 +126,9 @@ def train_controller(
         return run.train(recipe.steps if stop_after is None else min(stop_after, recipe.steps), progress, report)
 
 
-def _network_of(init: Policy, recipe: ControllerRecipe, model: Any) -> Controller | EndToEnd:
-    """Return the network to go on from, after checking that it takes what the recipe feeds."""
-    if not isinstance(init, Policy):
-        raise CheckpointError(
-            f"--init is a {type(init).__name__}, expected a policy such as transformer_1d_z.released."
-        )
-    wanted = make_network(recipe, model)
-    network = init.network
-    if type(network) is not type(wanted) or init.features != (None if recipe.features == "e2e" else recipe.features):
-        raise CheckpointError(
-            f"--init {init.name} takes {init.features or 'observations'}, expected {recipe.features}: they do not fit."
-        )
-    assert isinstance(network, Controller | EndToEnd)
-    first, other = network.pi[0], wanted.pi[0]
-    assert isinstance(first, nn.Linear)
-    assert isinstance(other, nn.Linear)
-    if init.lidar != recipe.lidar or first.in_features != other.in_features:
-        raise CheckpointError(
-            f"--init {init.name} has {first.in_features} inputs for {init.lidar}, expected {other.in_features} for "
-            f"{recipe.lidar}: name the world model that it was trained with."
-        )
-    return network
+def _stream(recipe: ControllerRecipe, step: int) -> int:
+    """Return the seed of worlds and noise from a step on."""
+    return int(np.random.SeedSequence([recipe.seed, step]).generate_state(1, np.uint32)[0])
 
 
 class _Run(BaseCallback):
@@ -247,16 +143,16 @@ class _Run(BaseCallback):
         self.policy_now = make_policy(recipe, network, model, model_name)
         self.at = state.Progress()
         folder = state.last_folder(out) if resume else None
-        done = int(read_json(folder / "training.json", _MAX_JSON)["step"]) if folder is not None else 0
-        # worlds of a resumed run come from a stream of their own
-        stream = int(np.random.SeedSequence([recipe.seed, done]).generate_state(1, np.uint32)[0])
+        done = state.read_step(folder) if folder is not None else 0
         self.worlds = TrainingWorlds(
-            environment(recipe), self.policy_now, recipe.worlds, seed=stream, max_speed=network.config.max_speed,
-            reward_scale=recipe.reward_scale, truncate=not recipe.original,
+            environment(recipe), self.policy_now, recipe.worlds, seed=_stream(recipe, done),
+            max_speed=network.config.max_speed, reward_scale=recipe.reward_scale, truncate=not recipe.original,
         )  # fmt: skip
         self.ppo = make_ppo(recipe, self.worlds, network, device)
         if folder is not None:
             self.at = state.load(folder, network, self.ppo.policy.optimizer, self.ppo.policy)
+            if "difficulty" in self.at.extra:
+                self.worlds.simulator.set_difficulty(self.at.extra["difficulty"].cpu().numpy())
         if folder is not None or pretrained:
             put_weights(self.ppo.policy, network)
         else:  # start from stable-baselines3's orthogonal weights, but with the scaled inputs
@@ -274,7 +170,7 @@ class _Run(BaseCallback):
         take_weights(self.network, self.ppo.policy)
         if isinstance(self.network, Controller) and not self.recipe.original:
             vae = self.policy_now.vae
-            _scale_inputs(self.network, vae.config.z_size if vae is not None and "z" in self.recipe.features else 0)
+            scale_inputs(self.network, vae.config.z_size if vae is not None and "z" in self.recipe.features else 0)
             put_weights(self.ppo.policy, self.network)
 
     def _description(self) -> dict[str, Any]:
@@ -298,9 +194,10 @@ class _Run(BaseCallback):
             total=self.recipe.steps, initial=self.at.step, unit="step", unit_scale=True, disable=not progress
         )
         self.began = time.perf_counter()
+        self._seed()
         try:
             if self.at.step < stop:
-                self.ppo.learn(stop - self.at.step, callback=self, reset_num_timesteps=False)
+                self._learn(stop - self.at.step)
                 self._checkpoint(validate=True)
         finally:
             self.bar.close()
@@ -313,6 +210,23 @@ class _Run(BaseCallback):
             report(f"{self.out}: {self.at.step:,} steps, {rate:,.0f} steps/s, best validation {best:.1%}{more}")
         curve(self.out)
         return TrainedController(self.out, self.at.step, best, rate, held_out)
+
+    def _learn(self, steps: int) -> None:
+        try:
+            self.ppo.learn(steps, callback=self, reset_num_timesteps=False)
+        except ValueError:  # torch's distributions refuse what is not finite
+            self._check_finite()
+            raise
+
+    def _check_finite(self) -> None:
+        """Raise where an update left weights that are not finite: nothing of that is saved."""
+        if all(bool(torch.isfinite(p).all()) for p in self.ppo.policy.parameters()):
+            return
+        last = state.last_folder(self.out)
+        kept = f"The last good checkpoint is {last}" if last is not None else "There is no checkpoint yet"
+        raise TrainingError(
+            f"Weights are NaN after {self.ppo.num_timesteps:,} steps, expected finite ones. {kept}; lower lr."
+        )
 
     # --- callback ----------------------------------------------------------------------------------------------
 
@@ -327,10 +241,25 @@ class _Run(BaseCallback):
             self.ppo.lr_schedule = lambda _: rate
         if now == self.at.step:
             return
+        self._check_finite()
         due = now // self.recipe.validate_every > self.at.step // self.recipe.validate_every
         self._log(now)
         if due:
             self._checkpoint(validate=True)
+            self._start_worlds()
+
+    def _seed(self) -> None:
+        """Draw noise and order from here on from seed and step alone."""
+        stream = _stream(self.recipe, self.at.step)
+        np.random.seed(stream)  # noqa: NPY002  stable-baselines3 shuffles rollouts by this one
+        torch.manual_seed(stream)
+
+    def _start_worlds(self) -> None:
+        """Go on as a run that resumes from this checkpoint does: in new worlds, so that no world's state is kept."""
+        self.worlds.restart(_stream(self.recipe, self.at.step), self.worlds.simulator.difficulty())
+        self._seed()
+        self.ppo._last_obs = self.worlds.reset()
+        self.ppo._last_episode_starts = np.ones(self.worlds.num_envs, bool)
 
     def _log(self, now: int) -> None:
         self.spent += time.perf_counter() - self.began
@@ -357,14 +286,11 @@ class _Run(BaseCallback):
         )  # fmt: skip
 
     def _checkpoint(self, validate: bool) -> None:
-        if self.ppo.num_timesteps > self.at.step and not self._finite():
-            last = state.last_folder(self.out)
-            raise TrainingError(
-                f"Weights are NaN after {self.ppo.num_timesteps:,} steps. The last good checkpoint is {last}: lower lr."
-            )
+        self._check_finite()
         clock = time.perf_counter()
         self.spent += clock - self.began
         self.at.step = self.ppo.num_timesteps
+        self.at.extra = {"difficulty": torch.from_numpy(self.worlds.simulator.difficulty())}
         take_weights(self.network, self.ppo.policy)
         if validate:
             rate = self._success(AUTHORS_SEEDS if self.recipe.original else VALIDATION_SEEDS)
@@ -376,9 +302,6 @@ class _Run(BaseCallback):
         state.commit(self.out, self.at)
         state.publish(self.out, self.at.best_step)
         self.began = time.perf_counter()
-
-    def _finite(self) -> bool:
-        return all(bool(torch.isfinite(p).all()) for p in self.ppo.policy.parameters())
 
     def _success(self, seeds: range) -> float:
         """Return the share of validation episodes that end at the goal; the policy acts by its mean."""
@@ -398,5 +321,6 @@ class _Run(BaseCallback):
             "selected_on": f"navrep-test, original physics, numpy seeds {seeds.start} to {seeds.stop - 1}",
             "step": self.at.step,
             "seconds": round(self.at.seconds, 1),
+            "machine": machine(self.ppo.device),
             "best_validation": None if self.at.best is None else 1.0 - self.at.best,
         }

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from navrep_data.io import atomic_write_bytes
+from navrep_data.io.logs import LOG_FILE, read_log
 
-LOG_FILE = "log.csv"
+__all__ = ["LOG_FILE", "Logger", "curve", "picture", "read_log"]
 
 
 class Logger:
@@ -64,20 +65,6 @@ class Logger:
         """Flush and close."""
         if self._board is not None:
             self._board.close()
-
-
-def read_log(out: Path) -> list[dict[str, str]]:
-    """Return the rows of a training's ``log.csv`` as written; empty where there is none."""
-    path = Path(out) / LOG_FILE
-    if not path.is_file():
-        return []
-    with open(path, newline="") as handle:
-        # a killed run may have cut the last line short
-        return [
-            {name: value for name, value in row.items() if value}
-            for row in csv.DictReader(handle)
-            if None not in row and None not in row.values() and str(row.get("step", "")).isdecimal()
-        ]
 
 
 def _tensorboard(folder: Path, after: int) -> Any:

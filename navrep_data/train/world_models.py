@@ -191,7 +191,8 @@ def claim(
     if not path.is_file():
         raise ConfigError(f"There is no training to resume in {out}: expected {state.RECIPE_FILE}; leave out --resume.")
     before = read_json(path, _MAX_RECIPE)
-    old = before.get("settings", {}) if isinstance(before, dict) else {}
+    old = before.get("settings") if isinstance(before, dict) else None
+    old = old if isinstance(old, dict) else {}
     for name, value in settings.items():
         if name not in free and old.get(name) != value:
             raise ConfigError(
@@ -376,14 +377,19 @@ class _Loop:
             "step": at.step,
             "seconds": round(at.seconds, 1),
             "validation": self.validation,
-            "machine": {
-                "device": str(self.device) if self.device.type == "cpu" else torch.cuda.get_device_name(self.device),
-                "processor": platform.machine(),
-                "threads": torch.get_num_threads(),
-                "cores": os.cpu_count(),
-                "torch": torch.__version__,
-            },
+            "machine": machine(self.device),
         }
+
+
+def machine(device: torch.device) -> dict[str, Any]:
+    """Return what trained: device, processor, threads, cores, torch."""
+    return {
+        "device": str(device) if device.type == "cpu" else torch.cuda.get_device_name(device),
+        "processor": platform.machine(),
+        "threads": torch.get_num_threads(),
+        "cores": os.cpu_count(),
+        "torch": torch.__version__,
+    }
 
 
 def _start_from(model: nn.Module, init: nn.Module) -> None:

@@ -66,6 +66,7 @@ class TrainingWorlds(VecEnv):
         reward_scale: float = 1.0,
         truncate: bool = True,
     ) -> None:
+        self.config = config
         self.simulator = Simulator(config, n_worlds, seed=seed)
         self.policy, self.max_speed, self.reward_scale, self.truncate = policy, max_speed, reward_scale, truncate
         self._actions = np.zeros((n_worlds, N_ACTIONS), np.float32)
@@ -88,6 +89,12 @@ class TrainingWorlds(VecEnv):
         scan, state = self.simulator.observe()
         self._last = self.policy.encode(scan, state)
         return self._last.copy()
+
+    def restart(self, seed: int, difficulty: NDArray[np.int64]) -> None:
+        """Go on in worlds from another stream, as difficult as given; call :meth:`reset` next."""
+        self.simulator = Simulator(self.config, self.num_envs, seed=seed)
+        self.simulator.set_difficulty(difficulty)
+        self.outcomes = []
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Take the actions of the next step."""

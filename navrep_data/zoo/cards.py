@@ -1,4 +1,6 @@
-"""Model cards, one per variant, made from the registry: ``python -m navrep_data.zoo.cards cards/models``.
+"""Model cards, made from the registry: ``python -m navrep_data.zoo.cards cards/models``.
+
+One per variant for what the authors released, one per checkpoint for what this project trained.
 
 Notes
 -----
@@ -12,8 +14,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from navrep_data.zoo._markdown import table
 from navrep_data.zoo.names import OWN, RELEASED, RELEASED_RULE, default_tag
-from navrep_data.zoo.registry import Record, dependants, variants
+from navrep_data.zoo.own_cards import is_benchmark, own_card
+from navrep_data.zoo.registry import Record, dependants, records, variants
 
 _ARCHITECTURES = {
     "modular": "V and M trained one after the other: a variational autoencoder, then an LSTM with mixture outputs",
@@ -38,12 +42,8 @@ _FORMATS = {
 }
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join(lines + ["| " + " | ".join("-" if v is None else str(v) for v in row) + " |" for row in rows])
-
-
-def _summary(r: Record) -> str:
+def summary(r: Record) -> str:
+    """Return in a sentence what a checkpoint is."""
     architecture = _ARCHITECTURES[r.architecture]
     if r.kind in ("policy", "controller"):
         reads = f"Controller on {_FEATURES[r.features]}, and the robot state. " if r.features else ""
@@ -74,7 +74,8 @@ def inputs(r: Record) -> list[tuple[str, str, str]]:
     rows = [("`obs`", shape, _scan_words(r))] if r.kind != "memory" else [("`z`", f"(B, T, {r.z_size})", "code of V")]
     if r.kind != "vae":
         rows.append(("`goal`", "(B, T, 2) [m]", "goal x, goal y, robot frame"))
-        rows.append(("`action`", "(B, T, 3) [m/s, m/s, rad/s]", "the action that led to the row"))
+        which = "chosen at the row" if r.action_alignment == "taken" else "that led to the row"
+        rows.append(("`action`", "(B, T, 3) [m/s, m/s, rad/s]", f"the action {which}"))
     return rows
 
 
@@ -96,6 +97,8 @@ def _feature_order(r: Record) -> str:
 def quirks(r: Record) -> list[str]:
     """Return what a user of this checkpoint should know beforehand."""
     found = []
+    if r.ours:
+        return _own_quirks(r)
     if r.kind in ("policy", "controller") and r.variant != "e2e_1d_carch":
         size = "from 600 up to 10^5" if r.architecture == "e2e" else "typically 300 to 1000"
         found.append(
@@ -128,13 +131,26 @@ def quirks(r: Record) -> list[str]:
     return found
 
 
+def _own_quirks(r: Record) -> list[str]:
+    found = []
+    if r.kind == "policy":
+        settings = (r.training or {})["settings"]
+        found.append(f"Trained to drive at {settings['max_speed']:g} m/s at most; omega is always 0.")
+    if r.action_alignment == "taken":
+        found.append(
+            "Action alignment `taken`: a row goes with the action chosen at it"
+            + ("; h is that after the row before." if r.features and "h" in r.features else ".")
+        )
+    return found
+
+
 def _ident(r: Record) -> str:
     return "; ".join(f"`{f.id}`" for f in r.files) or "-"
 
 
 def describe(r: Record) -> list[str]:
     """Return a record in words, one fact per line, for a terminal."""
-    lines = [r.name + (f"  (= {r.variant}.{RELEASED})" if r.released and r.tag != RELEASED else ""), _summary(r)]
+    lines = [r.name + (f"  (= {r.variant}.{RELEASED})" if r.released and r.tag != RELEASED else ""), summary(r)]
     for name, shape, meaning in inputs(r):
         lines.append(f"{name.strip('`')}: {shape} {meaning}")
     sizes = {"z": r.z_size, "h": r.h_size, "inputs": r.n_inputs, "parameters": r.n_parameters}
@@ -144,40 +160,46 @@ def describe(r: Record) -> list[str]:
     lines += [f"needs: {name}" for name in r.parts.values()]
     if r.started:
         lines.append(f"run started {r.started}, file written {r.saved}")
-    lines.append(f"from {r.source['repository']} at {r.source['commit']}, {r.source['license']}")
+    if r.ours:
+        lines.append(f"trained by {r.source['trained_by']}, NOT the NavRep authors' weights; {r.source['license']}")
+        lines += [f"made by: {command}" for command in (r.training or {})["commands"]]
+    else:
+        lines.append(f"from {r.source['repository']} at {r.source['commit']}, {r.source['license']}")
     lines += [f"quirk: {text}" for text in quirks(r)] + [f"note: {text}" for text in r.notes]
     lines += [f"result: {_result_words(x)}" for x in r.results] or ["results: not measured yet"]
     return lines
 
 
 def _result_words(x: dict[str, Any]) -> str:
+    if not is_benchmark(x):
+        ahead = "" if x["scan_mse"] is None else f"next frame {x['scan_mse']:.4g}, goal {x['goal_mse']:.4g} m2, "
+        return f"MSE, {x['split']} split, {x['rows']:,} rows: {ahead}V {x['reconstruction_mse']:.4g}; {x['command']}"
     return (
         f"{x['suite']} ({x['physics']} physics, {x['episodes']} episodes): success {x['success_rate']:.1%}, "
         f"`goal` on the same episodes {x['goal_success_rate']:.1%}; {x['command']}"
     )
 
 
-def _front_matter(variant: str, r: Record) -> str:
+def front_matter(name: str, r: Record) -> str:
+    """Return the YAML that the Hub reads."""
     task = "reinforcement-learning" if r.kind in ("policy", "controller") else "feature-extraction"
     tags = ["navrep", "robot-navigation", "lidar", "crowd", r.architecture]
     tags += ["ppo"] if r.kind in ("policy", "controller") else ["world-models"]
     lines = ["---", "license: mit", "library_name: navrep-data", f"pipeline_tag: {task}", "tags:"]
-    return "\n".join([*lines, *(f"- {tag}" for tag in tags), f"model_name: {variant}", "---"])
+    return "\n".join([*lines, *(f"- {tag}" for tag in tags), f"model_name: {name}", "---"])
 
 
-def _whose(variant: str, runs: Sequence[Record]) -> str:
-    if any(r.tag == OWN for r in runs):
-        lead = f"`{variant}.{OWN}`: Retrained by navrep-data; not the authors' checkpoint. The other runs are theirs."
-    else:
-        lead = "The NavRep authors' weights, not ours."
+def _whose(variant: str) -> str:
+    own = f" Ours: [`{variant}.{OWN}`]({variant}.{OWN}.md)." if f"{variant}.{OWN}" in records() else ""
     return (
-        f"{lead} navrep-data is an independent re-implementation, not made or endorsed by the authors; it "
-        "contains none of their files and fetches them from their repository."
+        "The NavRep authors' weights, not ours. navrep-data is an independent re-implementation, not made or endorsed "
+        f"by the authors; it contains none of their files and fetches them from their repository.{own}"
     )
 
 
-def _use(variant: str, r: Record) -> str:
-    load = f'model = navrep_data.zoo.load("{variant}.{RELEASED}")'
+def use(name: str, r: Record) -> str:
+    """Return how a checkpoint is loaded and called."""
+    load = f'model = navrep_data.zoo.load("{name}")'
     if r.kind == "policy":
         load = load.replace("model", "policy", 1)
         more = ["policy.reset(batch_size=1)", "action = policy.act(scan, robot_state)"]
@@ -199,7 +221,7 @@ def _runs_table(runs: Sequence[Record]) -> str:
         paths = "; ".join(f"`{f.path}`" for f in r.files) or "none of its own"
         size = ", ".join("not known" if f.bytes is None else f"{f.bytes:,}" for f in r.files) or "-"
         rows.append((name, r.started, r.saved, paths, size, _ident(r)))
-    return _table(("run", "started", "written", "file", "bytes", "checked by"), rows)
+    return table(("run", "started", "written", "file", "bytes", "checked by"), rows)
 
 
 def _results(runs: Sequence[Record]) -> str:
@@ -211,7 +233,7 @@ def _results(runs: Sequence[Record]) -> str:
     ]  # fmt: skip
     if not rows:
         return "Not measured yet."
-    return _table(("run", "suite", "episodes", "success rate", "`goal` on the same episodes", "command"), rows)
+    return table(("run", "suite", "episodes", "success rate", "`goal` on the same episodes", "command"), rows)
 
 
 def _parts(runs: Sequence[Record]) -> str:
@@ -233,20 +255,22 @@ def card(variant: str) -> str:
     """
     from navrep_data.shards.card import CITATION
 
-    runs = variants()[variant]
+    runs = [run for run in variants()[variant] if not run.ours]
     r = next((run for run in runs if run.released), runs[-1])
-    untagged = f"{variant}.{default_tag(variant)}"
+    untagged = f"`{variant}.{default_tag(variant)}`"
+    if default_tag(variant) == OWN and f"{variant}.{OWN}" not in records():
+        untagged += ", which this version does not contain"
     notes = [f"`{run.name}`: {note}" for run in runs for note in run.notes]
     one = f"`{variant}.{RELEASED}` is {r.released_rule}." if len(runs) == 1 else (
         f"`{variant}.{RELEASED}` is `{r.name}`. {RELEASED_RULE}"
     )  # fmt: skip
     formats = sorted({_FORMATS[run.format] for run in runs if run.format})
     sections = {
-        "Use": _use(variant, r),
-        "Inputs and outputs": _table(("name", "shape", "meaning"), inputs(r))
+        "Use": use(f"{variant}.{RELEASED}", r),
+        "Inputs and outputs": table(("name", "shape", "meaning"), inputs(r))
         + "\n\nOther lidars: `navrep_data.observations.ScanAdapter`. One row is "
         + f"{r.sensor['dt']:g} s.",
-        "Runs": f"{_runs_table(runs)}\n\n{one} The untagged name `{variant}` is `{untagged}`.",
+        "Runs": f"{_runs_table(runs)}\n\n{one} The untagged name `{variant}` is {untagged}.",
         "Needs": _parts(runs),
         "Results": _results(runs),
         "Known quirks": "\n".join(f"- {text}" for text in [*quirks(r), *notes]) or "None known.",
@@ -261,12 +285,12 @@ def card(variant: str) -> str:
     sizes = {"z": r.z_size, "h": r.h_size, "parameters stored": r.n_parameters}
     facts = ", ".join(f"{key} {value:,}" for key, value in sizes.items() if value is not None)
     body = "\n\n".join(f"## {title}\n\n{text}" for title, text in sections.items())
-    head = f"{_front_matter(variant, r)}\n\n# {variant}\n\n{_whose(variant, runs)}"
-    return f"{head}\n\n{_summary(r)} Sizes: {facts}.\n\n{body}\n"
+    head = f"{front_matter(variant, r)}\n\n# {variant}\n\n{_whose(variant)}"
+    return f"{head}\n\n{summary(r)} Sizes: {facts}.\n\n{body}\n"
 
 
 def write_cards(folder: Path) -> list[Path]:
-    """Write the cards of all variants into `folder`, and remove those of variants that are no more.
+    """Write all cards into `folder`, and remove those of what is no more.
 
     Returns
     -------
@@ -274,12 +298,13 @@ def write_cards(folder: Path) -> list[Path]:
         The files, sorted.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{variant}.md" for variant in variants()]
-    for path in paths:
-        path.write_text(card(path.stem), encoding="utf-8")
-    for path in set(folder.glob("*.md")) - set(paths):
+    texts = {f"{variant}.md": card(variant) for variant in variants()}
+    texts |= {f"{r.name}.md": own_card(r) for r in records().values() if r.ours}
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    for path in {path for path in folder.glob("*.md") if path.name not in texts}:
         path.unlink()
-    return paths
+    return sorted(folder / name for name in texts)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,9 @@
 
 Notes
 -----
-The authors' files are not part of this package. They are taken from their public repository at the commit that the
-records name, or from a Hugging Face repository that holds the same paths, and count only with the right hash.
+Our own weights are part of this package, and taken from nowhere else. The authors' files are not part of it. They are
+taken from their public repository at the commit that the records name, or from a Hugging Face repository that holds the
+same paths, and count only with the right hash.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from urllib.parse import quote
 
 from navrep_data.errors import ConfigError, CorruptDataError, DownloadError, ModelNotFoundError, OfflineError
 from navrep_data.io import cache_dir, download, is_offline, safe_join
+from navrep_data.zoo import registry
 from navrep_data.zoo.registry import FileEntry, Record, resolve, with_parts
 
 DIR_VARIABLE = "NAVREP_RELEASED_DIR"
@@ -125,6 +127,9 @@ def locate(entry: FileEntry, source: Source) -> tuple[Path | None, str | None]:
     wrong : str or None
         In what it differs from what it must be ("seen, expected"), None if it is right.
     """
+    if entry.packaged:
+        inside = safe_join(registry.FOLDER, entry.path)
+        return (inside, entry.id.mismatch(inside)) if inside.is_file() else (None, None)
     if source.folder is not None and (found := _in_folder(source.folder, entry)) is not None:
         return found, entry.id.mismatch(found)
     cached = safe_join(cache_folder(), entry.path)
@@ -155,6 +160,11 @@ def get_file(record: Record, entry: FileEntry, source: Source, *, progress: bool
         If it cannot be downloaded.
     """
     found, wrong = locate(entry, source)
+    if entry.packaged and (found is None or wrong is not None):
+        raise CorruptDataError(
+            f"{record.name} needs {entry.path} ({entry.id}) of this package, which is {wrong or 'missing'}: reinstall "
+            "navrep-data."
+        )
     cached = safe_join(cache_folder(), entry.path)
     if found is not None and wrong is None:
         return found
@@ -208,7 +218,7 @@ def fetch(name: str, source: str | os.PathLike[str] | None = None, *, progress: 
     UnknownNameError
         If there is no such name.
     CorruptDataError, OfflineError, DownloadError
-        As :func:`get_file`.
+        If a file is not what it must be, or cannot be had.
     """
     where = Source.of(source)
     return [path for r in with_parts(resolve(name)) for path in get_files(r, where, progress=progress).values()]

@@ -114,11 +114,25 @@ def read_policy(folder: Path | str) -> dict[str, Any]:
             f"{path} has format version {str(found.get('format_version'))[:20]}, expected {POLICY_VERSION}: install a "
             "newer navrep-data."
         )
+    check_described(found, path, {"parts": ([CONTROLLER], [CONTROLLER, "world_model"], [CONTROLLER, "vae"])})
+    if not isinstance(found.get("name"), str) or not isinstance(found.get("metadata"), dict):
+        raise CheckpointError(f"{path}: name or metadata are missing; get the policy again.")
+    return found
+
+
+def check_described(found: Mapping[str, Any], path: Path, more: Mapping[str, tuple[Any, ...]]) -> None:
+    """Refuse the description of a policy unless features, lidar, context, sensor and `more` are what they may be.
+
+    Raises
+    ------
+    CheckpointError
+        If one is not.
+    """
     allowed: dict[str, tuple[Any, ...]] = {
         "features": ("z", "h", "zh", None),
         "lidar": ("rings", "1d", None),
         "context": (*_CONTEXTS, None),
-        "parts": ([CONTROLLER], [CONTROLLER, "world_model"], [CONTROLLER, "vae"]),
+        **more,
     }
     for name, values in allowed.items():
         if found.get(name) not in values:
@@ -128,9 +142,6 @@ def read_policy(folder: Path | str) -> dict[str, Any]:
         sensor = {}
     if set(sensor) != set(SensorContract().to_dict()):
         raise CheckpointError(f"{path}: sensor is no sensor contract; get the policy again.")
-    if not isinstance(found.get("name"), str) or not isinstance(found.get("metadata"), dict):
-        raise CheckpointError(f"{path}: name or metadata are missing; get the policy again.")
-    return found
 
 
 def load_folder(
@@ -141,7 +152,7 @@ def load_folder(
     Parameters
     ----------
     path : path-like
-        Policy folder, checkpoint folder, or ``FILE.safetensors`` with its JSON beside it.
+        Policy folder, checkpoint folder, output folder of a training, or ``FILE.safetensors`` with its JSON beside it.
     inference, seed, **options
         As for :func:`navrep_data.zoo.load`.
 
@@ -157,6 +168,10 @@ def load_folder(
         raise ModelNotFoundError(f"There is no {path}, expected a folder with a checkpoint: check the path.")
     if not (path / POLICY_FILE).is_file():
         return _load_checkpoint(path, path.stem if path.is_file() else path.resolve().name, inference, seed, options)
+    if is_training(path):
+        from navrep_data.zoo.local import load_policy
+
+        return load_policy(path, inference=inference, seed=seed, **options)
     found = read_policy(path)
     from navrep_data.zoo.assemble import build
 
@@ -172,6 +187,28 @@ def load_folder(
         "lidar": found["lidar"], "context_rule": found["context"], "sensor": found["sensor"],
     }  # fmt: skip
     return build(record, _files(path / CONTROLLER), parts, inference=inference, seed=seed, **options)
+
+
+def is_training(path: Path) -> bool:
+    """Return whether a folder is a controller's training: its weights lie beside ``policy.json``, not in a folder."""
+    from navrep_data.models.checkpoint import WEIGHTS_NAME
+
+    return (path / POLICY_FILE).is_file() and (path / WEIGHTS_NAME).is_file()
+
+
+def policy_files(path: Path) -> dict[str, Path]:
+    """Return the files that decide what the policy in a folder does, by their names below it.
+
+    Parameters
+    ----------
+    path : Path
+        Policy folder, output folder of a training, or a folder with the checkpoint of an end-to-end network.
+    """
+    from navrep_data.models.checkpoint import CONFIG_NAME, WEIGHTS_NAME
+
+    parts = [path, *(path / part for part in PART_FOLDERS)]
+    found = [path / POLICY_FILE, *(part / name for part in parts for name in (CONFIG_NAME, WEIGHTS_NAME))]
+    return {file.relative_to(path).as_posix(): file for file in found if file.is_file()}
 
 
 def _files(path: Path) -> dict[str, Path]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from navrep_data.models import checkpoint
 from navrep_data.shards import CARD_FILE, FileEntry
 from navrep_data.shards.card import CITATION
 from navrep_data.shards.manifest import check_license
-from navrep_data.zoo.folders import PART_FOLDERS, POLICY_FILE, load_folder, read_policy
+from navrep_data.zoo.folders import PART_FOLDERS, POLICY_FILE, is_training, load_folder, read_policy, save_policy
 
 LIST_FILE = "navrep-model.json"
 LIST_FORMAT = "navrep-data-model-files"
@@ -69,7 +70,8 @@ def push_model(
     Parameters
     ----------
     path : path-like
-        Folder with a checkpoint or a policy (:func:`navrep_data.zoo.save_policy`), or ``FILE.safetensors``.
+        Folder with a checkpoint or a policy (:func:`navrep_data.zoo.save_policy`), output folder of a training, or
+        ``FILE.safetensors``.
     repo : str
         ``user/name``; made if there is none.
     license : str
@@ -95,7 +97,14 @@ def push_model(
         raise ConfigError(f"{problem[0].upper()}{problem[1:]}.")
     client.require_network(f"push {os.fspath(path)} to {name}")
     path = Path(path)
-    load_folder(path)  # what cannot be loaded is not published
+    loaded = load_folder(path)  # what cannot be loaded is not published
+    if is_training(path):
+        with tempfile.TemporaryDirectory() as scratch:
+            made = Path(scratch) / "policy"
+            save_policy(loaded, made, checkpoint.read_config(path)["metadata"])
+            return push_model(
+                made, repo, license=license, private=private, revision=revision, message=message, token=token
+            )
     files: dict[str, bytes | Path] = dict(_files(path))
     entries = {n: FileEntry(n, sha256_file(p), p.stat().st_size) for n, p in files.items() if isinstance(p, Path)}
     listed = {"format": LIST_FORMAT, "files": [asdict(entry) for entry in entries.values()]}

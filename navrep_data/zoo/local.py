@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-from navrep_data.errors import CheckpointError, CorruptDataError
+from navrep_data.errors import CheckpointError
 from navrep_data.io import read_json
 from navrep_data.schema import SensorContract
+from navrep_data.zoo.folders import check_described
 
 POLICY_FILE = "policy.json"
 """Beside a controller's weights: what it sees through."""
@@ -30,7 +31,8 @@ def load_any_model(name: str | os.PathLike[str], source: str | os.PathLike[str] 
     ----------
     name : str or path-like
         Name such as ``transformer_1d.released``, or a folder with ``model.safetensors`` and ``config.json``: a
-        checkpoint of :mod:`navrep_data.models.checkpoint`, or what ``navrep-data train`` wrote.
+        checkpoint of :mod:`navrep_data.models.checkpoint`, what ``navrep-data train`` wrote, or a policy of
+        :func:`navrep_data.zoo.save_policy`.
     source : path-like or str, optional
         Where names are looked for, see :func:`navrep_data.zoo.load`.
     **options
@@ -56,8 +58,12 @@ def load_any_model(name: str | os.PathLike[str], source: str | os.PathLike[str] 
         raise CheckpointError(
             f"There is no {path}; expected a folder with model.safetensors, or a name: navrep-data models"
         )
-    if (path / POLICY_FILE).is_file():
+    from navrep_data.zoo.folders import is_training, load_folder
+
+    if is_training(path):
         return load_policy(path, **options)
+    if (path / POLICY_FILE).is_file():
+        return load_folder(path, **options)
     from navrep_data.models import checkpoint
 
     return checkpoint.load(path)
@@ -76,21 +82,19 @@ def load_policy(folder: Path, **options: Any) -> Any:
     Raises
     ------
     CorruptDataError
-        If ``policy.json`` is not what training writes.
+        If ``policy.json`` is no JSON.
     CheckpointError
-        If a checkpoint is missing or does not fit.
+        If ``policy.json`` is not what training writes, or a checkpoint is missing or does not fit.
     """
     from navrep_data.models import VAE, ActorCritic, WorldModel, checkpoint
     from navrep_data.zoo.policy import Policy
 
     found = read_json(folder / POLICY_FILE, _MAX_JSON)
-    try:
-        features, lidar, context, part = (found[key] for key in ("features", "lidar", "context", "world_model"))
-        sensor = SensorContract(**found["sensor"])
-        if part not in (None, PARTS):
-            raise ValueError(f"world_model {str(part)[:40]!r}")
-    except (KeyError, TypeError, ValueError) as error:
-        raise CorruptDataError(f"{folder / POLICY_FILE} lacks or garbles a field ({error!r}); get it again.") from error
+    if not isinstance(found, dict):
+        raise CheckpointError(f"{folder / POLICY_FILE} is not the description of a policy; get it again.")
+    check_described(found, folder / POLICY_FILE, {"world_model": (None, PARTS)})
+    features, lidar, context, part = (found.get(key) for key in ("features", "lidar", "context", "world_model"))
+    sensor = SensorContract(**found["sensor"])
     network = checkpoint.load(folder)
     if not isinstance(network, ActorCritic):
         raise CheckpointError(f"{folder} holds a {type(network).__name__}, expected a controller.")

@@ -25,6 +25,10 @@ RELEASED_RULE = (
 WILDCARDS = "*?["
 
 
+SHIPPED_BYTES = 45_000_000
+"""The weights in the package take at most this much."""
+
+
 def split_name(name: str) -> tuple[str, str | None]:
     """Return variant and tag of a name; the tag is None where the name has none.
 

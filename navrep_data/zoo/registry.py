@@ -12,9 +12,9 @@ import fnmatch
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from functools import cache
-from importlib import resources
+from pathlib import Path
 from typing import Any
 
 from navrep_data.errors import UnknownNameError, did_you_mean
@@ -22,6 +22,9 @@ from navrep_data.io import FileId
 from navrep_data.zoo.names import OWN, RELEASED, WILDCARDS, alias_line, default_tag, split_name
 
 KINDS = ("policy", "controller", "world_model", "vae", "memory")
+FOLDER = Path(__file__).parent
+"""Holds ``records/`` and, for what this project trained, ``weights/``."""
+RECORDS, WEIGHTS = "records", "weights"
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class FileEntry:
     Attributes
     ----------
     path : str
-        Relative POSIX path, as in the authors' repository.
+        Relative POSIX path, as in the authors' repository; ``weights/...`` for files that are part of this package.
     bytes : int or None
         Size, None where it is not known.
     sha256, git_blob_sha1 : str or None
@@ -47,6 +50,11 @@ class FileEntry:
     def id(self) -> FileId:
         """What the file must be, for checks and downloads."""
         return FileId(self.bytes, self.sha256, self.git_blob_sha1)
+
+    @property
+    def packaged(self) -> bool:
+        """Whether the file is part of this package."""
+        return self.path.startswith(f"{WEIGHTS}/")
 
 
 @dataclass(frozen=True)
@@ -84,11 +92,11 @@ class Record:
     parts : dict
         Role (world_model, vae, memory) to full name of the checkpoints that this one needs.
     format : str or None
-        sb2-zip, torch-state-dict or tf-json; None for a checkpoint without files of its own.
+        sb2-zip, torch-state-dict or tf-json; safetensors for our own; None for a checkpoint without files of its own.
     files : tuple of FileEntry
         Files to fetch and check.
     source : dict
-        Repository, commit, license and the authors' words for the variant.
+        Repository, commit, license and the authors' words for the variant; for our own who trained it and license.
     started, saved : str or None
         When the run began and when its file was written, as its name and time stamps say.
     golden : tuple of str
@@ -97,6 +105,9 @@ class Record:
         What is odd about it.
     results : tuple of dict
         Measured results, each with the command that made it.
+    training : dict or None
+        How this project trained it: commands, settings, seed, dataset, steps, seconds, machine, what half precision
+        costs, validation. None for the authors' checkpoints.
     """
 
     name: str
@@ -126,14 +137,16 @@ class Record:
     golden: tuple[str, ...]
     notes: tuple[str, ...]
     results: tuple[dict[str, Any], ...]
+    training: dict[str, Any] | None = None
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Record:
-        """Make a record of its JSON; keys must be exactly the fields."""
+        """Make a record of its JSON; keys must be exactly the fields, those with a default may be left out."""
         known = {f.name for f in fields(cls)}
-        if set(data) != known:
+        needed = {f.name for f in fields(cls) if f.default is MISSING}
+        if wrong := (set(data) - known) | (needed - set(data)):
             raise UnknownNameError(
-                f"Record {data.get('name')!r} has the wrong keys {sorted(set(data) ^ known)}: reinstall navrep-data."
+                f"Record {data.get('name')!r} has the wrong keys {sorted(wrong)}: reinstall navrep-data."
             )
         lists = {key: tuple(data[key]) for key in ("golden", "notes", "results")}
         return cls(**{**data, **lists, "files": tuple(FileEntry(**entry) for entry in data["files"])})
@@ -145,21 +158,25 @@ class Record:
 
     @property
     def is_checkpoint(self) -> bool:
-        """Whether it has files of its own; V and M together as a world model have none."""
+        """Whether it has files of its own; the authors' V and M together as a world model have none."""
         return bool(self.files)
+
+    @property
+    def ours(self) -> bool:
+        """Whether this project trained it, and not the authors."""
+        return self.tag == OWN
 
 
 @cache
 def records() -> dict[str, Record]:
-    """Return all records by full name, sorted: 61 released checkpoints and the two pairs of V and M."""
-    folder = resources.files("navrep_data.zoo") / "records"
-    found = (Record.from_dict(json.loads(f.read_bytes())) for f in folder.iterdir() if f.name.endswith(".json"))
+    """Return all records by full name, sorted: 61 released checkpoints, the two pairs of V and M, and our own."""
+    found = (Record.from_dict(json.loads(f.read_bytes())) for f in (FOLDER / RECORDS).glob("*.json"))
     return {record.name: record for record in sorted(found, key=lambda r: r.name)}
 
 
 @cache
 def variants() -> dict[str, tuple[Record, ...]]:
-    """Return the runs of every variant, oldest first."""
+    """Return the runs of every variant: our own, then the authors', oldest first."""
     runs: dict[str, list[Record]] = {}
     for record in records().values():
         runs.setdefault(record.variant, []).append(record)
@@ -229,9 +246,14 @@ def find(name: str) -> Record:
         meant = f"{name} means {variant}.{OWN} (trained by navrep-data)" if name == variant else f"{name}"
         raise UnknownNameError(
             f"{meant}: this version of navrep-data does not contain it. "
-            f"The NavRep authors' weights: {variant}.{RELEASED}"
+            f"The NavRep authors' weights: {variant}.{RELEASED}{_shipped_hint()}"
         )
     raise UnknownNameError(f"Unknown model {name!r}: {variant} has no tag {tag!r}. Its runs: {every}")
+
+
+def _shipped_hint() -> str:
+    ours = [r.name for r in records().values() if r.ours]
+    return f". Trained by navrep-data and here: {', '.join(ours)}" if ours else ""
 
 
 def resolve(name: str) -> Record:

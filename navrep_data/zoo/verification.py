@@ -13,12 +13,15 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 from navrep_data.errors import ConfigError, CorruptDataError, NavrepDataError
+from navrep_data.io.npz import read_npz
 from navrep_data.zoo.fetching import Source, locate, missing_here
 from navrep_data.zoo.names import WILDCARDS
 from navrep_data.zoo.registry import Record, find, list_models, records, variants
+
+# The largest golden file has 1 MB.
+_MAX_GOLDEN_BYTES = 256 << 20
 
 
 @dataclass(frozen=True)
@@ -170,7 +173,8 @@ def _check(record: Record, where: Source, golden: Path | None) -> Check:
         path, wrong = locate(entry, where)
         if path is None:
             missing.append(asdict(entry))
-            problems.append(f"{entry.path} ({entry.id}) {where.lacks()}")
+            where_not = "is not in this package: reinstall navrep-data" if entry.packaged else where.lacks()
+            problems.append(f"{entry.path} ({entry.id}) {where_not}")
         elif wrong is not None:
             problems.append(f"{path} has {wrong}")
     needs = tuple(dict.fromkeys(part.name for part, _ in missing_here(record, where) if part != record))
@@ -221,6 +225,10 @@ def open_alone(record: Record, path: Path) -> Any:
     module: Any
     if record.format == "sb2-zip":
         module = importers.load_controller_zip(path)
+    elif record.format == "safetensors":
+        from navrep_data.models import checkpoint
+
+        module = checkpoint.load(path)
     elif record.format == "torch-state-dict":
         module = importers.load_torch_world_model(path)
     else:
@@ -254,12 +262,10 @@ def _compare(record: Record, module: Any, path: Path, where: Source, needs: tupl
 
 
 def _arrays(path: Path) -> dict[str, Any]:
-    import numpy as np
-
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        with open(path, "rb") as file:
+            return read_npz(file, _MAX_GOLDEN_BYTES)
+    except (OSError, ValueError) as error:
         raise CorruptDataError(f"{path} is no npz file ({error}): get the golden outputs again.") from error
 
 

@@ -33,19 +33,22 @@ def run(tmp_path):
 def test_list(run):
     done = run()
     assert done.returncode == 0, done.stderr
-    assert len(done.stdout.splitlines()) == 64
+    lines = [line for line in done.stdout.splitlines() if not line.split()[0].endswith(".v1")]
+    assert len(lines) == 64
     assert "transformer_rings_z.20201004" in done.stdout
     assert "= transformer_rings_z.released" in done.stdout
     done = run("*rings_z")
     assert done.stdout == "", "wildcards that match no full name"
-    assert run("*rings_z.*").stdout.count("\n") == 11
-    assert len(json.loads(run("e2e_1d", "--json").stdout)) == 3
+    assert run("*rings_z.2*").stdout.count("\n") == 11
+    assert len(json.loads(run("modular_1d_h", "--json").stdout)) == 3
     assert json.loads(run("--json").stdout)[0]["here"] is False
 
 
 def test_list_tells_what_is_here(run, shared):
     found = json.loads(run("--json", NAVREP_RELEASED_DIR=str(shared / "released")).stdout)
-    assert sum(r["here"] for r in found if r["kind"] == "policy") == 19
+    theirs = [r for r in found if r["tag"] != "v1"]
+    assert sum(r["here"] for r in theirs if r["kind"] == "policy") == 19
+    assert all(r["here"] for r in found if r["tag"] == "v1")
     gone = next(r for r in found if r["name"] == "transformer_rings_z.20201004")
     assert gone["not_here"] == ["models/W/navreptraingpt"]
 
@@ -70,9 +73,11 @@ def test_show(run):
     found = json.loads(run("show", E2E, "--json").stdout)
     assert found["name"] == E2E
     assert found["files"][0]["bytes"] == 1017662
-    done = run("show", "e2e_1d", "--json")
-    assert done.stderr == "e2e_1d -> e2e_1d.20201027: the NavRep authors' weights (e2e_1d.released)\n"
-    assert json.loads(done.stdout)["name"] == "e2e_1d.20201027"
+    done = run("show", "modular_1d_h", "--json")
+    assert done.stderr == (
+        "modular_1d_h -> modular_1d_h.20200920: the NavRep authors' weights (modular_1d_h.released)\n"
+    )
+    assert json.loads(done.stdout)["name"] == "modular_1d_h.20200920"
 
 
 def test_fetch_offline(run, shared, tmp_path):
@@ -101,7 +106,7 @@ def test_verify_all(run, shared):
     done = run("verify", "--all", "--from", shared / "released", "--golden", shared / "golden")
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
-    assert sum(line.startswith("ok ") for line in lines) == 56
+    assert sum(line.startswith("ok ") and ".v1" not in line for line in lines) == 56
     missing = [lines[i + 1] for i, line in enumerate(lines) if line.startswith("missing ")]
     assert len(missing) == 5
     for path, blob, policies in [
@@ -112,7 +117,9 @@ def test_verify_all(run, shared):
         ("models/W/navreptrainvaelstm", "5f7ed72a7208b54f84afb3a3609810118985ffc0", 7),
     ]:
         assert any(f"{path} (git blob {blob})" in m and f"; {policies} policies need it" in m for m in missing)
-    assert any(line.startswith("61 checkpoints: 56 right, 5 missing, 0 wrong; ") for line in lines)
+    ours = sum(".v1" in line for line in lines if line.startswith("ok "))
+    counts = f"{61 + ours} checkpoints: {56 + ours} right, 5 missing, 0 wrong; "
+    assert any(line.startswith(counts) for line in lines)
     assert "34 policies depend on files that are not here and cannot run:" in lines
 
 

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from navrep_data._version import __version__
 from navrep_data.datasets import SequenceDataset
-from navrep_data.errors import ConfigError
-from navrep_data.evaluate.world_model import dream, figure, table, world_model_error
+from navrep_data.errors import ConfigError, CorruptDataError
+from navrep_data.evaluate.world_model import dream, world_model_error
+from navrep_data.evaluate.world_model_results import figure, load, save, table
 from navrep_data.models import checkpoint
 from navrep_data.testing import tiny_dataset
 
@@ -96,8 +98,34 @@ def test_table_and_figure(dataset, tmp_path):
     assert (tmp_path / "errors.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_of_v_alone_the_reconstruction_is_measured_over_the_same_rows(dataset, tmp_path):
+    model = make("transformer")
+    whole = world_model_error(model, dataset, split="train", steps=2, name="W")
+    alone = world_model_error(model.vae, dataset, split="train", steps=2, name="V")
+    assert (alone.rows, alone.scan_mse, alone.goal_mse, alone.dream_scan_mse) == (whole.rows, None, None, [])
+    assert alone.reconstruction_mse == pytest.approx(whole.reconstruction_mse, rel=1e-5)
+    assert alone.still_scan_mse == pytest.approx(whole.still_scan_mse)
+    lines = table([whole, alone])
+    assert lines[3].split()[2:4] == ["-", "-"]
+    with pytest.raises(ConfigError, match="no world model to draw"):
+        figure([alone], tmp_path / "none.png")
+
+
+def test_results_are_files(dataset, tmp_path):
+    found = world_model_error(make("joint"), dataset, split="val", steps=2, name="./models/joint 1")
+    path = save(found, tmp_path, {"name": "d", "content_hash": "0"}, {"model": "1"})
+    assert path == tmp_path / "world-model" / ".-models-joint-1.val.json"
+    assert load(path) == (
+        found,
+        {"data": {"name": "d", "content_hash": "0"}, "files": {"model": "1"}, "navrep_data": __version__},
+    )
+    path.write_text(path.read_text().replace('"rows"', '"lines"'))
+    with pytest.raises(CorruptDataError, match="no world-model result of this version"):
+        load(path)
+
+
 def test_bad_input(dataset):
     with pytest.raises(ConfigError, match="expected a world model"):
-        world_model_error(checkpoint.make("vae", {}), dataset)
+        world_model_error(checkpoint.make("memory", {}), dataset)
     with pytest.raises(ConfigError, match="steps is 40"):
         world_model_error(make("transformer"), dataset, steps=40)

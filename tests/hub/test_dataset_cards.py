@@ -40,6 +40,7 @@ def test_cards_are_current():
         published = cards.PUBLISHED[env]
         assert (manifest.env, manifest.license, manifest.complete) == (env, published.license, True)
         assert manifest.command == published.command
+        assert manifest.card_sha256 == sha256_file(FOLDER / f"{env}.md")
 
 
 def test_pictures_are_those_of_the_manifests():
@@ -84,8 +85,8 @@ def test_cards_of_maps_say_that_the_maps_have_no_licence(env):
     card, config = (FOLDER / f"{env}.md").read_text(), cards.read_published(FOLDER, env).config
     on_maps = config.get("world") == "map"
     assert on_maps == (env == "ian")
-    assert ("`asl-pepper-2d-sim`" in card and "**which states no licence**" in card) == on_maps
-    assert ("humans that follow ORCA" in card) == ("\n- orca\n" in card) == (not on_maps)
+    assert ("`asl-pepper-2d-sim`, which states no licence" in card) == on_maps
+    assert ("humans that follow ORCA." in card) == ("\n- orca\n" in card) == (not on_maps)
     assert cards.PUBLISHED[env].license == ("other" if on_maps else "mit")  # nobody may licence others' maps
 
 

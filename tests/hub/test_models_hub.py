@@ -176,6 +176,18 @@ def test_a_policy_goes_up_and_comes_down(hub, tmp_path, features):
         zoo.load(f"hf://{REPO}")
 
 
+def test_a_trainings_folder_goes_up_as_a_policy(hub, tmp_path):
+    """What ``train controller`` writes: the controller's weights at the top, its world model in a folder."""
+    policy, folder = a_policy("z"), tmp_path / "training"
+    checkpoint.save(policy.network, folder, {"step": 3})
+    checkpoint.save(policy.vae, folder / "world_model")
+    described = {"format": "navrep-data-policy", "features": "z", "lidar": "1d", "context": None,
+                 "world_model": "world_model", "sensor": policy.sensor.to_dict()}  # fmt: skip
+    (folder / "policy.json").write_bytes(json_bytes(described))
+    push_model(folder, REPO, license="mit")
+    np.testing.assert_array_equal(actions(zoo.load(f"hf://{REPO}")), actions(policy))
+
+
 def test_another_model_leaves_nothing_of_the_first(hub, tmp_path):
     zoo.save_policy(a_policy(), tmp_path / "p")
     push_model(tmp_path / "p", REPO, license="mit")

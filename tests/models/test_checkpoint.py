@@ -52,6 +52,31 @@ def test_saving_is_reproducible(tmp_path):
     assert checkpoint.save(module, tmp_path / "b").read_bytes() == first
 
 
+def test_half_precision_takes_half_the_bytes_and_rounds(tmp_path):
+    module = checkpoint.make("controller", {"n_inputs": 69})
+    whole = checkpoint.save(module, tmp_path / "whole")
+    half = checkpoint.save(module, tmp_path / "half", storage="float16")
+    assert half.stat().st_size < 0.55 * whole.stat().st_size
+    assert "weights_dtype" not in checkpoint.read_config(tmp_path / "whole")
+    loaded = checkpoint.load(tmp_path / "half").state_dict()
+    for name, value in module.state_dict().items():
+        assert loaded[name].dtype == torch.float32
+        assert torch.equal(loaded[name], value.half().float())
+    torch.nn.init.constant_(module.logstd, 1e5)
+    with pytest.raises(CheckpointError, match="network in float16: 'logstd' holds NaN or infinity"):
+        checkpoint.save(module, tmp_path / "large", storage="float16")
+    with pytest.raises(ConfigError, match="storage is 'int8'"):
+        checkpoint.save(module, tmp_path / "large", storage="int8")
+
+
+@pytest.mark.parametrize(("said", "words"), [("int8", "weights_dtype is 'int8'"), (["x"], "weights_dtype is"),
+                                             ("float16", "is torch.float32, expected float16")])  # fmt: skip
+def test_wrong_storage_is_refused(saved, said, words):
+    edit(saved, weights_dtype=said)
+    with pytest.raises(CheckpointError, match=words):
+        checkpoint.load(saved)
+
+
 @pytest.fixture
 def saved(tmp_path):
     checkpoint.save(checkpoint.make("controller", {"n_inputs": 8}), tmp_path)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import config as numba_config
 
-from navrep_data.errors import ConfigError
+from navrep_data.errors import ConfigError, SimulationError
 from navrep_data.schema import Event
 from navrep_data.sim import RolloutSettings, ScriptedPolicy, ScriptedRollout, Simulator, make_config
 from navrep_data.sim import _layout as lay
@@ -29,6 +29,24 @@ def finish(sim, outcomes):
     _, events = sim.step(np.zeros((sim.n_worlds, 3)))
     np.testing.assert_array_equal(events, [outcome or 0 for outcome in outcomes])
     sim.reset()
+
+
+def test_difficulty_is_set_for_the_next_episodes():
+    sim = Simulator(make_config("navrep-train", curriculum="adaptive"), n_worlds=WORLDS, seed=0)
+    sim.reset()
+    sim.set_difficulty(np.tile([0, 3], (WORLDS, 1)))
+    np.testing.assert_array_equal(sim.difficulty(), np.tile([0, 3], (WORLDS, 1)))
+    sim.reset()  # breaks the episodes off, which changes nothing
+    np.testing.assert_array_equal(sim.difficulty(), np.tile([0, 3], (WORLDS, 1)))
+    assert (sim.arrays.scalars[:, lay.S_HUMANS] == 0).all()
+    for wrong in (
+        [[0, 3]],
+        np.tile([6, 0], (WORLDS, 1)),
+        np.tile([0.5, 0], (WORLDS, 1)),
+        np.tile([-1, 0], (WORLDS, 1)),
+    ):
+        with pytest.raises(SimulationError, match="difficulty has shape"):
+            sim.set_difficulty(wrong)
 
 
 @pytest.mark.parametrize("physics", ["consistent", "original"])

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from navrep_data.errors import CheckpointError, ConfigError, DatasetMismatchError
+from navrep_data import zoo
+from navrep_data.errors import CheckpointError, ConfigError, DatasetMismatchError, TrainingError
 from navrep_data.models import Controller, ControllerConfig, checkpoint
 from navrep_data.models.controllers import limit_speed
 from navrep_data.schema import Event
@@ -18,6 +19,7 @@ from navrep_data.train.controller_recipe import (
     original_controller_recipe,
 )
 from navrep_data.train.logs import read_log
+from navrep_data.train.state import last_folder
 from navrep_data.train.worlds import TrainingWorlds, play, shorten
 from navrep_data.zoo.local import load_any_model
 from navrep_data.zoo.policy import Policy
@@ -116,10 +118,12 @@ def test_a_few_steps_leave_a_policy_that_loads_and_drives(features, few_episodes
 
 
 @pytest.mark.slow
-def test_ppo_moves_actor_critic_and_width_and_nothing_of_the_encoder(few_episodes, tmp_path):
-    model = world_model()
-    before = {name: p.clone() for name, p in model.named_parameters()}
-    recipe = default_controller_recipe("z", "1d").replace(**{**SMALL, "steps": 64})
+@pytest.mark.parametrize("features", ["z", "h", "zh", "e2e"])
+def test_ppo_moves_actor_critic_and_width_and_nothing_of_the_encoder(features, few_episodes, tmp_path):
+    """End to end it moves the convolutions, too."""
+    model = None if features == "e2e" else world_model()
+    before = {} if model is None else {name: p.clone() for name, p in model.named_parameters()}
+    recipe = default_controller_recipe(features, "1d").replace(**{**SMALL, "steps": 64})
     controllers.train_controller(recipe, tmp_path / "a", model=model, stop_after=64)
     first = checkpoint.load(tmp_path / "a" / "checkpoints" / "step-00000064")
     controllers.train_controller(recipe.replace(lr=1e-9), tmp_path / "b", model=model, stop_after=64)
@@ -127,7 +131,8 @@ def test_ppo_moves_actor_critic_and_width_and_nothing_of_the_encoder(few_episode
     for name, p in first.named_parameters():
         moved = float((p - dict(still.named_parameters())[name]).detach().abs().max())
         assert (moved > 1e-5) == (not name.startswith("q.")), name
-    assert all(torch.equal(p, before[name]) for name, p in model.named_parameters())
+    if model is not None:
+        assert all(torch.equal(p, before[name]) for name, p in model.named_parameters())
 
 
 @pytest.mark.slow
@@ -143,6 +148,45 @@ def test_resume_goes_on_and_refuses_other_settings(few_episodes, tmp_path):
     done = controllers.train_controller(recipe, out, model=model, resume=True)
     assert done.steps == 128
     assert [r["step"] for r in read_log(out) if "val_success" in r] == ["64", "128"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("features", ["z", "zh", "e2e"])
+def test_a_resume_gives_the_same_weights(features, few_episodes, tmp_path):
+    model = None if features == "e2e" else world_model()
+    # 24 steps per world between checkpoints: episodes are cut there, and some end and adapt their difficulty
+    recipe = default_controller_recipe(features, "1d").replace(**{**SMALL, "rollout": 24, "steps": 576, "batch": 64,
+                                                                  "validate_every": 192})  # fmt: skip
+    controllers.train_controller(recipe, tmp_path / "whole", model=model)
+    controllers.train_controller(recipe, tmp_path / "parts", model=model, stop_after=192)
+    controllers.train_controller(recipe, tmp_path / "parts", model=model, resume=True, stop_after=384)
+    controllers.train_controller(recipe, tmp_path / "parts", model=model, resume=True)
+    ours, theirs = (checkpoint.load(last_folder(tmp_path / name)) for name in ("whole", "parts"))
+    for (name, a), b in zip(ours.named_parameters(), theirs.parameters(), strict=True):
+        assert torch.equal(a, b), name
+    a, b = (
+        [{k: v for k, v in r.items() if k not in ("seconds", "steps_per_s")} for r in read_log(tmp_path / name)]
+        for name in ("whole", "parts")
+    )
+    assert a[-1] == b[-1]
+
+
+@pytest.mark.slow
+def test_nan_stops_and_keeps_the_last_good_checkpoint(few_episodes, tmp_path, monkeypatch):
+    step_wait, steps = TrainingWorlds.step_wait, []
+
+    def poisoned(self):
+        obs, rewards, done, infos = step_wait(self)
+        steps.append(0)
+        return obs, rewards * (np.float32("nan") if len(steps) > 12 else 1), done, infos
+
+    monkeypatch.setattr(TrainingWorlds, "step_wait", poisoned)
+    recipe = default_controller_recipe("z", "1d").replace(**SMALL)
+    with pytest.raises(TrainingError, match=r"Weights are NaN after 128 steps.*step-00000064; lower lr") as error:
+        controllers.train_controller(recipe, tmp_path / "c", model=world_model())
+    assert "\n" not in str(error.value)
+    assert last_folder(tmp_path / "c").name == "step-00000064"
+    assert load_any_model(tmp_path / "c").features == "z"
 
 
 @pytest.mark.slow
@@ -183,6 +227,20 @@ def test_a_network_is_continued(few_episodes, tmp_path):
         torch.testing.assert_close(p, before[name], rtol=1e-4, atol=1e-6)
     with pytest.raises(CheckpointError, match="do not fit"):
         controllers.train_controller(recipe.replace(features="zh"), tmp_path / "d", model=model, init=init)
+
+
+@pytest.mark.slow
+def test_a_released_policy_is_continued(shared, few_episodes, tmp_path, monkeypatch):
+    monkeypatch.setenv("NAVREP_RELEASED_DIR", str(shared / "released"))
+    init = zoo.load("transformer_1d_z.released")
+    model = zoo.load("transformer_1d.released")
+    recipe = default_controller_recipe("z", "1d").replace(**{**SMALL, "steps": 64, "lr": 1e-9})
+    controllers.train_controller(recipe, tmp_path / "c", model=model, model_name="transformer_1d.released", init=init)
+    policy = load_any_model(tmp_path / "c")
+    scan, state = Simulator(environment(recipe), 6, seed=1).observe()
+    for one in (policy, init):
+        one.reset(batch_size=6)
+    np.testing.assert_allclose(policy.act(scan, state), init.act(scan, state), atol=1e-3)
 
 
 def test_bad_input(tmp_path):

@@ -5,15 +5,25 @@ import math
 import pytest
 import torch
 
-from navrep_data.models import MDNRNN, MemoryConfig, Mixture, Noise, TransformerConfig, TransformerWorldModel
+from navrep_data.models import (
+    MDNRNN,
+    MemoryConfig,
+    Mixture,
+    Noise,
+    TransformerConfig,
+    TransformerWorldModel,
+    checkpoint,
+)
 from navrep_data.train import default_recipe, original_recipe
 from navrep_data.train.losses import (
     Counts,
     divergence,
+    memory_loss,
     mixture_nll,
     observation_loss,
     restart_loss,
     run_with_restarts,
+    vae_loss,
     world_model_loss,
 )
 from navrep_data.train.optim import decaying, learning_rate
@@ -114,17 +124,58 @@ def test_the_parts_of_a_batch_add_up_to_it_and_padding_does_not_count():
     assert loss(0, 4) == pytest.approx(whole, rel=1e-5)
 
 
-def test_gradients_reach_every_weight_of_a_transformer():
+def unreached(model):
+    return [n for n, p in model.named_parameters() if p.grad is None or not bool(p.grad.abs().sum() > 0)]
+
+
+@pytest.mark.parametrize("original", [False, True])
+@pytest.mark.parametrize("kind", ["joint", "transformer"])
+def test_gradients_reach_every_weight_of_a_world_model(kind, original):
     from navrep_data.train.data import part
 
     torch.manual_seed(0)
-    model = TransformerWorldModel(TransformerConfig("1d", 16, 2, 2, 4))
-    recipe = default_recipe("transformer", "1d")
+    settings = {"lidar": "1d", "z_size": 16}
+    settings |= {"h_size": 32} if kind == "joint" else {"n_blocks": 2, "n_heads": 2, "context": 4}
+    model = checkpoint.make(kind, settings).train()
+    # beyond the step at which the weight of the KL divergence has risen
+    recipe = (original_recipe if original else default_recipe)(kind, "1d").replace(kl_floor=0.0)
     batch = part(batch_of(2, 4, [4, 4]), 0, 2)
-    world_model_loss(model, batch, recipe, 0, Noise.seeded(0), Counts(8, 6, 8, 6)).total.backward()
-    without = [n for n, p in model.named_parameters() if p.grad is None or not bool(p.grad.abs().sum() > 0)]
+    world_model_loss(model, batch, recipe, 5000, Noise.seeded(0), Counts(8, 6, 8, 6)).total.backward()
     # softmax does not see what is added to all its inputs alike
-    assert [n for n in without if not n.endswith("attn.key.bias")] == []
+    assert [n for n in unreached(model) if not n.endswith("attn.key.bias")] == []
+
+
+def test_the_prediction_teaches_memory_and_encoder_by_itself():
+    from navrep_data.train.data import part
+
+    torch.manual_seed(0)
+    model = TransformerWorldModel(TransformerConfig("1d", 16, 1, 2, 4))
+    batch = part(batch_of(2, 4, [4, 4]), 0, 2)
+    batch["reconstruct"] = torch.zeros(2, 4, dtype=torch.bool)
+    recipe = default_recipe("transformer", "1d").replace(kl_weight=0.0)
+    world_model_loss(model, batch, recipe, 5000, Noise.seeded(0), Counts(8, 6, 0, 6)).total.backward()
+    assert {"vae.encoder.0.weight", "blocks.0.attn.query.weight", "z_head.weight", "action_emb.weight"} <= {
+        n for n, p in model.named_parameters() if p.grad is not None and bool(p.grad.abs().sum() > 0)
+    }
+
+
+def test_gradients_reach_every_weight_of_v_and_m():
+    torch.manual_seed(0)
+    v = checkpoint.make("vae", {"lidar": "1d", "z_size": 8}).train()
+    vae_loss(
+        v, torch.rand(3, 1080), default_recipe("v", "1d"), 5000, Noise.seeded(0), Counts(3, 0, 3, 0)
+    ).total.backward()
+    assert unreached(v) == []
+    m = checkpoint.make("memory", {"z_size": 4, "h_size": 8}).train()
+    rows = {
+        name: torch.randn(2, 5, n)
+        for name, n in (("z", 4), ("next_z", 4), ("goal", 2), ("next_goal", 2), ("action", 3))
+    }
+    flags = {"restart": torch.zeros(2, 5), "next_last": torch.zeros(2, 5)}
+    masks = dict.fromkeys(("mask", "next_mask"), torch.ones(2, 5, dtype=torch.bool))
+    terms, _ = memory_loss(m, {**rows, **flags, **masks}, default_recipe("m", "1d"))
+    terms.total.backward()
+    assert unreached(m) == []
 
 
 def test_only_matrices_decay_by_default_and_nearly_all_by_the_authors():

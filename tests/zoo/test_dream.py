@@ -97,7 +97,7 @@ def test_reaching_the_goal_ends_the_dream_and_time_cuts_it(dataset):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["transformer", "joint"])
+@pytest.mark.parametrize("kind", list(SMALL))
 def test_pictures(kind, dataset):
     env = DreamEnv(make(kind), dataset, render_mode="rgb_array")
     env.reset(seed=0)

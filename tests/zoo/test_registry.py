@@ -15,6 +15,8 @@ from navrep_data.zoo import names, registry
 from navrep_data.zoo.names import alias_line
 
 RECORDS = registry.records()
+# what this project trained is tested in tests/train/test_shipping.py
+THEIRS = {name: r for name, r in RECORDS.items() if not r.ours}
 INPUTS = {"z": lambda r: r.z_size + 5, "h": lambda r: 5 + r.h_size, "zh": lambda r: r.z_size + 5 + r.h_size}
 
 
@@ -24,18 +26,18 @@ def released(shared):
 
 
 def test_sixty_one_checkpoints_and_two_pairs():
-    assert sum(r.is_checkpoint for r in RECORDS.values()) == 61
+    assert sum(r.is_checkpoint for r in THEIRS.values()) == 61
     assert [r.name for r in RECORDS.values() if not r.is_checkpoint] == [
         "modular_1d.released",
         "modular_rings.released",
     ]
-    kinds = Counter(r.kind for r in RECORDS.values() if r.is_checkpoint)
+    kinds = Counter(r.kind for r in THEIRS.values() if r.is_checkpoint)
     assert kinds == {"policy": 52, "controller": 1, "world_model": 4, "vae": 2, "memory": 2}
 
 
 def test_every_released_file_has_its_record(released):
     wanted = {f["path"]: f for f in released["files"] if f["kind"] in ("V", "M", "W", "C", "E2E")}
-    found = {f.path: (r, f) for r in RECORDS.values() for f in r.files}
+    found = {f.path: (r, f) for r in THEIRS.values() for f in r.files}
     assert set(found) == set(wanted)
     for path, f in wanted.items():
         record, entry = found[path]
@@ -72,10 +74,13 @@ def test_records_agree_with_themselves(name):
     for part in r.parts.values():
         assert RECORDS[part].lidar == r.lidar
         assert RECORDS[part].architecture == r.architecture
-    if r.kind == "policy" and r.architecture != "e2e":
+    assert (r.training is not None) == r.ours
+    if r.ours:
+        assert all(RECORDS[part].ours for part in r.parts.values())
+    elif r.kind == "policy" and r.architecture != "e2e":
         roles = {"modular": {"vae"} if r.features == "z" else {"vae", "memory"}}.get(r.architecture, {"world_model"})
         assert set(r.parts) == roles
-    if r.context_rule:
+    if r.context_rule and not r.ours:
         assert r.context_rule == ("carried-state" if r.architecture == "modular" else "oldest-32")
     assert registry.Record.from_dict(json.loads(json.dumps(r.to_dict()))) == r
 
@@ -83,7 +88,7 @@ def test_records_agree_with_themselves(name):
 def test_released_is_one_run_of_each_variant_by_the_stated_rule():
     for runs in registry.variants().values():
         assert sum(r.released for r in runs) == 1
-        last = max((r for r in runs if "partial" not in r.tag), key=lambda r: r.started or "")
+        last = max((r for r in runs if "partial" not in r.tag and not r.ours), key=lambda r: r.started or "")
         assert last.released
     assert "started last" in names.RELEASED_RULE
 
@@ -112,11 +117,12 @@ def test_which_policies_need_what_is_missing():
 def test_list_models():
     everything = zoo.list_models()
     assert everything == sorted(everything)
-    assert len(everything) == 85
+    assert len([name for name in everything if not name.endswith(".v1")]) == 85
     assert {"e2e_1d.20201026", "e2e_1d.released", "transformer_rings.released"} <= set(everything)
     assert all("rings" in name for name in zoo.list_models("*rings*"))
     assert len(zoo.list_models("*.released")) == 32
-    assert zoo.list_models("e2e_1d") == [f"e2e_1d.{tag}" for tag in ("20200901", "20201026", "20201027", "released")]
+    runs = [f"e2e_rings.{tag}" for tag in ("20201026", "20201027", "released")]
+    assert [name for name in zoo.list_models("e2e_rings") if not name.endswith(".v1")] == runs
     assert zoo.list_models("e2e_1d.20201026") == ["e2e_1d.20201026"]
     assert zoo.list_models("nothing*") == []
 
@@ -160,10 +166,10 @@ def test_short_tag_of_two_runs_lists_them():
 def test_full_names_say_nothing_untagged_ones_say_whose_weights(capsys):
     assert zoo.show("e2e_1d.released").name == "e2e_1d.20201027"
     assert capsys.readouterr().err == ""
-    zoo.show("e2e_1d")
+    zoo.show("modular_1d_h")
     out, err = capsys.readouterr()
     assert out == ""
-    assert err == "e2e_1d -> e2e_1d.20201027: the NavRep authors' weights (e2e_1d.released)\n"
+    assert err == "modular_1d_h -> modular_1d_h.20200920: the NavRep authors' weights (modular_1d_h.released)\n"
 
 
 def test_the_line_for_own_weights():
@@ -173,7 +179,11 @@ def test_the_line_for_own_weights():
     )
 
 
-def test_untagged_name_of_a_variant_about_to_ship_never_means_the_authors():
+def test_untagged_name_of_a_variant_about_to_ship_never_means_the_authors(capsys):
+    if "transformer_rings_z.v1" in RECORDS:
+        assert zoo.show("transformer_rings_z").ours
+        assert "NOT the NavRep authors' weights" in capsys.readouterr().err
+        return
     with pytest.raises(
         UnknownNameError, match=r"means transformer_rings_z\.v1.*weights: transformer_rings_z\.released"
     ):

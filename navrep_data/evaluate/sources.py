@@ -1,0 +1,167 @@
+"""Whose results are whose: results files below a folder, told apart by who trained what they measured."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from navrep_data.errors import CorruptDataError, DatasetMismatchError
+from navrep_data.evaluate.policies import BASELINES
+from navrep_data.evaluate.results import Results
+from navrep_data.evaluate.scores import score, summary
+from navrep_data.evaluate.suites import suite_names
+from navrep_data.evaluate.world_model import WorldModelError
+from navrep_data.evaluate.world_model_results import FOLDER
+from navrep_data.evaluate.world_model_results import load as load_world_model
+from navrep_data.zoo import registry
+from navrep_data.zoo.local import is_folder
+from navrep_data.zoo.names import OWN
+from navrep_data.zoo.registry import Record
+
+SOURCES = {
+    "authors": "authors' own figure",
+    "released": "released weights, measured by us",
+    "ours": "our weights, measured by us",
+    "baseline": "baseline, measured by us",
+    "other": "other, measured by us",
+}
+"""Where a number comes from, in words for legends."""
+
+
+def full_name(name: str) -> str:
+    """Return the full name of a model of the zoo; a folder as it is."""
+    return name if is_folder(name) else registry.find(name).name
+
+
+def weights_of(name: str) -> dict[str, str]:
+    """Return the hashes of a model's files, its parts' included, by file."""
+    if not is_folder(name):
+        return _hashes(registry.find(name))
+    from navrep_data.models import checkpoint
+
+    return {"model.safetensors": str(checkpoint.read_config(name).get("weights_sha256"))}
+
+
+def _hashes(record: Record) -> dict[str, str]:
+    parts = registry.with_parts(record)
+    return {e.path: e.sha256 or f"git:{e.git_blob_sha1}" for r in parts for e in r.files}
+
+
+def source_of(name: str) -> str:
+    """Return ``"released"``, ``"ours"``, ``"baseline"`` or ``"other"``: a key of :data:`SOURCES`."""
+    variant, _, tag = name.partition(".")
+    if name in BASELINES:
+        return "baseline"
+    if variant in registry.variants():
+        return "ours" if tag == OWN else "released"
+    return "other"
+
+
+def find_benchmarks(folder: Path, suite: str, physics: str = "original") -> list[Results]:
+    """Return all results of a suite below a folder, by name; of two of the same, the one with more episodes.
+
+    Raises
+    ------
+    CorruptDataError
+        If a file is no results file.
+    """
+    found: dict[str, Results] = {}
+    for path in sorted(folder.rglob(f"{suite}-{physics}/*.json")):
+        results = Results.load(path)
+        if (results.suite.name, results.physics) != (suite, physics):
+            raise CorruptDataError(f"{path} holds {results.suite.name} in {results.physics} physics: move it apart.")
+        known = found.get(results.name)
+        if known is None or _played(results) > _played(known):
+            found[results.name] = results
+    return [found[name] for name in sorted(found)]
+
+
+def _played(results: Results) -> int:
+    return len(results.outcome) - len(results.missing(len(results.outcome)))
+
+
+def find_world_models(folder: Path) -> list[tuple[WorldModelError, dict[str, Any]]]:
+    """Return all world-model results below a folder with what is said about them."""
+    return [load_world_model(path) for path in sorted(folder.rglob(f"{FOLDER}/*.json"))]
+
+
+def benchmark_entries(folder: Path, record: Record) -> list[dict[str, Any]]:
+    """Return what a record says of its benchmark results below a folder, `goal` on the same episodes beside each.
+
+    Raises
+    ------
+    DatasetMismatchError
+        If they were measured with other weights.
+    CorruptDataError
+        If the results of `goal` are missing.
+    """
+    entries = []
+    for suite in suite_names():
+        for physics in ("original", "consistent"):
+            found = {r.name: r for r in find_benchmarks(folder, suite, physics)}
+            mine = found.get(record.name)
+            if mine is None:
+                continue
+            _same_weights(mine.header["settings"]["policy_files"], record, str(folder))
+            if "goal" not in found:
+                raise CorruptDataError(
+                    f"{folder} has no results of 'goal' in {suite}, expected them beside every score."
+                )
+            entries.append(_entry(mine, found["goal"], record))
+    return entries
+
+
+def _same_weights(files: dict[str, str], record: Record, where: str) -> None:
+    if files != _hashes(record):
+        raise DatasetMismatchError(
+            f"{where} has results of other weights than {record.name} has now: measure again in another folder."
+        )
+
+
+def _entry(mine: Results, goal: Results, record: Record) -> dict[str, Any]:
+    row, suite = summary(mine), mine.suite
+    played = [k for k in range(len(mine.outcome)) if mine.outcome[k] != "-"]
+    command = f"navrep-data benchmark {record.name} --suite {suite.name}"
+    if mine.physics != suite.physics:
+        command += f" --physics {mine.physics}"
+    rounds = row["episodes"] / len(suite.scenarios)
+    if rounds != suite.rounds:
+        command += f" --episodes {rounds:g}"
+    shares = ("success_rate", "success_rate_low", "success_rate_high", "collision_rate", "timeout_rate")
+    entry: dict[str, Any] = {
+        "suite": suite.name,
+        "physics": mine.physics,
+        "episodes": row["episodes"],
+        **{key: round(row[key], 6) for key in shares},
+        "goal_success_rate": round(score(goal, played)["success_rate"], 6),
+        "command": command,
+    }
+    if "per_map" in row:
+        entry["per_map"] = {name: round(part["success_rate"], 6) for name, part in row["per_map"].items()}
+    return entry
+
+
+def world_model_entries(folder: Path, record: Record) -> list[dict[str, Any]]:
+    """Return what a record says of its world-model errors below a folder.
+
+    Raises
+    ------
+    DatasetMismatchError
+        If they were measured with other weights.
+    """
+    entries = []
+    for result, about in find_world_models(folder):
+        if result.name != record.name:
+            continue
+        _same_weights(about["files"], record, os.fspath(folder))
+        keys = ("scan_mse", "goal_mse", "reconstruction_mse", "still_scan_mse", "still_goal_mse")
+        entries.append(
+            {
+                "suite": "world-model", "split": result.split, "rows": result.rows,
+                **{key: None if (v := getattr(result, key)) is None else float(f"{v:.6g}") for key in keys},
+                "data": {key: about["data"].get(key) for key in ("name", "content_hash", "rows")},
+                "command": f"navrep-data evaluate world-model {record.name} --data DIR --split {result.split}",
+            }
+        )  # fmt: skip
+    return entries

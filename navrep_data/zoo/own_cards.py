@@ -1,0 +1,143 @@
+"""Cards of the checkpoints that this project trained, one per checkpoint, made from their records."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from navrep_data.zoo._markdown import table
+from navrep_data.zoo.names import RELEASED
+from navrep_data.zoo.registry import Record, dependants
+
+FIRST_LINE = "Retrained by navrep-data; not the authors' checkpoint."
+_MACHINE = ("device", "processor", "cores", "threads", "torch")
+_BENCHMARK_HEAD = (
+    "suite", "physics", "episodes", "success (95 % interval)", "`goal` on the same episodes", "collision", "timeout",
+    "command",
+)  # fmt: skip
+_WORLD_MODEL_HEAD = (
+    "split", "rows", "next frame MSE", "standing still", "next goal [m2]", "standing still", "reconstruction MSE",
+    "command",
+)  # fmt: skip
+
+
+def is_benchmark(entry: dict[str, Any]) -> bool:
+    """Return whether a result is a share of episodes, and not a world-model error."""
+    return "success_rate" in entry
+
+
+def results(r: Record) -> str:
+    """Return the tables of a record's results, each with command and baseline."""
+    scores = [
+        (
+            x["suite"], x["physics"], x["episodes"],
+            f"{x['success_rate']:.1%} ({x['success_rate_low']:.1%} to {x['success_rate_high']:.1%})",
+            f"{x['goal_success_rate']:.1%}", f"{x['collision_rate']:.1%}", f"{x['timeout_rate']:.1%}",
+            f"`{x['command']}`",
+        )
+        for x in r.results
+        if is_benchmark(x)
+    ]  # fmt: skip
+    errors = [
+        (
+            x["split"], f"{x['rows']:,}", _number(x["scan_mse"]), _number(x["still_scan_mse"]), _number(x["goal_mse"]),
+            _number(x["still_goal_mse"]), _number(x["reconstruction_mse"]), f"`{x['command']}`",
+        )
+        for x in r.results
+        if not is_benchmark(x)
+    ]  # fmt: skip
+    parts = [table(_BENCHMARK_HEAD, scores)] if scores else []
+    for x in r.results:
+        if "per_map" in x:
+            shares = ", ".join(f"{name} {share:.1%}" for name, share in x["per_map"].items())
+            parts.append(f"{x['suite']} per map: {shares}.")
+    if errors:
+        data = sorted({f"{x['data']['name']} (content hash `{x['data']['content_hash'][:16]}`)" for x in r.results
+                       if not is_benchmark(x)})  # fmt: skip
+        parts += [table(_WORLD_MODEL_HEAD, errors), f"DIR: {'; '.join(data)}."]
+    return "\n\n".join(parts) or "Not measured yet."
+
+
+def _number(value: float | None) -> str | None:
+    return None if value is None else f"{value:.4g}"
+
+
+def recipe(r: Record) -> str:
+    """Return how a checkpoint was trained."""
+    t = r.training or {}
+    machine = t.get("machine") or {}
+    facts: list[tuple[str, Any]] = [("seed", t.get("seed")), ("steps", f"{t['step']:,} of {t['steps']:,}")]
+    facts.append(("time of the steps", _hours(t.get("seconds"))))
+    facts.append(("machine", ", ".join(f"{key} {machine[key]}" for key in _MACHINE if key in machine) or None))
+    if d := t.get("dataset"):
+        facts.append(("dataset", f"{d['name']}, {d['rows']:,} rows, content hash `{d['content_hash']}`"))
+    if "selected_on" in t:
+        facts.append(("chosen by", f"{t['selected_on']}; the test suites were not looked at"))
+    if t.get("validation"):
+        facts.append(("validation", ", ".join(f"{key} {value:.4g}" for key, value in t["validation"].items())))
+    commands = "\n".join(t["commands"])
+    settings = json.dumps(t["settings"], ensure_ascii=False)
+    return (
+        f"```\n{commands}\n```\n\n{table(('', ''), facts)}\n\n<details><summary>All settings</summary>\n\n"
+        f"```json\n{settings}\n```\n\n</details>"
+    )
+
+
+def _hours(seconds: float | None) -> str | None:
+    return None if seconds is None else f"{seconds / 3600:.2f} h, validation and saving not counted"
+
+
+def half_precision(r: Record) -> str:
+    """Return what storing the weights in half precision costs."""
+    cost = (r.training or {})["half_precision"]
+    words = [f"Weights are stored as {cost['storage']} and computed with as float32."]
+    if "z_change" in cost:
+        words.append(
+            f"Against the weights as trained, a number of z changes by at most {cost['z_change']:.2g} (its standard "
+            f"deviation is {cost['z_spread']:.2g}); the reconstruction error is "
+            f"{cost['reconstruction_mse_stored']:.6g} instead of {cost['reconstruction_mse']:.6g}."
+        )
+    if "action_change" in cost:
+        words.append(
+            f"Against the weights as trained, an action changes by at most {cost['action_change']:.2g} m/s, by "
+            f"{cost['action_change_mean']:.2g} m/s in the mean."
+        )
+    words.append(f"Measured on {cost['rows']:,} rows of a test split; results are of the stored weights.")
+    return " ".join(words)
+
+
+def own_card(r: Record) -> str:
+    """Return the card of a checkpoint as Markdown with the front matter of the Hugging Face Hub.
+
+    Parameters
+    ----------
+    r : Record
+        Of a checkpoint that this project trained.
+    """
+    from navrep_data.shards.card import CITATION
+    from navrep_data.zoo import cards
+
+    users = sorted(d.name for d in dependants(r) if d.name != r.name)
+    needs = [f"- {role}: `{name}`" for role, name in r.parts.items()]
+    needs += [f"- used by: {', '.join(f'`{name}`' for name in users)}"] if users else []
+    files = [(f"`navrep_data/zoo/{f.path}`", f"{f.bytes:,}", f"`{f.sha256}`") for f in r.files]
+    sections = {
+        "Use": cards.use(r.name, r) + "\n\nThe weights are part of the package: nothing is fetched.",
+        "Inputs and outputs": table(("name", "shape", "meaning"), cards.inputs(r))
+        + f"\n\nOther lidars: `navrep_data.observations.ScanAdapter`. One row is {r.sensor['dt']:g} s.",
+        "Results": results(r),
+        "Recipe": recipe(r),
+        "Half precision": half_precision(r),
+        "Files": table(("file", "bytes", "SHA-256"), files),
+        "Needs": "\n".join(needs) or "Nothing else.",
+        "Known quirks": "\n".join(f"- {text}" for text in [*cards.quirks(r), *r.notes]) or "None known.",
+        "Provenance": f"Trained by {r.source['trained_by']}, {r.source['license']} licence. navrep-data is an "
+        "independent re-implementation, not made or endorsed by the NavRep authors; their checkpoint is "
+        f"`{r.variant}.{RELEASED}`.",
+        "Cite": f"```bibtex\n{CITATION}\n```",
+    }
+    body = "\n\n".join(f"## {title}\n\n{text}" for title, text in sections.items())
+    sizes = {"z": r.z_size, "h": r.h_size, "parameters": r.n_parameters}
+    facts = ", ".join(f"{key} {value:,}" for key, value in sizes.items() if value is not None)
+    head = f"{cards.front_matter(r.name, r)}\n\n# {r.name}\n\n{FIRST_LINE}"
+    return f"{head}\n\n{cards.summary(r)} Sizes: {facts}.\n\n{body}\n"

@@ -1,0 +1,203 @@
+"""The paper's figures from results files: what is drawn from whom, and what is told where results are missing."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError
+from navrep_data.evaluate.metrics import METRICS
+from navrep_data.evaluate.policies import PilotSpec
+from navrep_data.evaluate.reproduce import FIGURES, reproduce
+from navrep_data.evaluate.reproduce.drawn import authors
+from navrep_data.evaluate.reproduce.testing import PARTS, scores
+from navrep_data.evaluate.results import Results, file_name, header_of
+from navrep_data.evaluate.sources import find_benchmarks, source_of
+from navrep_data.evaluate.suites import get_suite
+from navrep_data.evaluate.world_model import WorldModelError
+from navrep_data.evaluate.world_model_results import save
+from navrep_data.testing import tiny_dataset
+
+
+def results(folder, name, outcome, suite="navrep27", variant=None, physics="original", inference="deterministic"):
+    """Write a results file with the given outcome per episode."""
+    spec = PilotSpec(name, "scan", variant or name.partition(".")[0], "zoo", inference=inference)
+    found = Results(header_of(spec, get_suite(suite), physics))
+    n = len(outcome)
+    found.outcome, found.events, found.steps = list(outcome), ["goal"] * n, [10] * n
+    found.metrics = {m.name: [1.0] * n for m in METRICS}
+    found.trajectories = {k: np.array([[0.0, 0.0], [1.0, 0.1 * k]]) for k in range(n)}
+    home = folder / f"{suite}-{physics}"
+    home.mkdir(parents=True, exist_ok=True)
+    found.save(home / file_name(spec))
+
+
+@pytest.fixture
+def measured(tmp_path, maps):
+    """Two runs of one released variant, one of another, one of ours, and a baseline; 27 episodes each."""
+    results(tmp_path, "e2e_1d.20201026", "S" * 9 + "C" * 18)
+    results(tmp_path, "e2e_1d.20201027", "S" * 18 + "C" * 9)
+    results(tmp_path, "transformer_rings_z.20201004", "S" * 3 + "T" * 24)
+    results(tmp_path, "transformer_rings_z.v1", "S" * 21 + "T" * 6, variant="transformer_rings_z.v1")
+    results(tmp_path, "goal", "S" * 5 + "C" * 22)
+    return tmp_path
+
+
+def test_whose_numbers():
+    names = ("e2e_1d.20201026", "transformer_rings_z.v1", "goal", "./models/x", "my.module:drive")
+    assert [source_of(name) for name in names] == ["released", "ours", "baseline", "other", "other"]
+
+
+def test_runs_of_a_variant_are_one_bar_and_ours_is_never_among_them(measured):
+    found = scores(find_benchmarks(measured, "navrep27"))
+    two = found["e2e_1d"]["released"]["all"]
+    assert (two["value"], two["low"], two["high"], len(two["runs"])) == (0.5, 1 / 3, 2 / 3, 2)
+    assert set(found["transformer_rings_z"]) == {"released", "ours"}
+    assert found["transformer_rings_z"]["ours"]["all"]["value"] == pytest.approx(21 / 27)
+    assert (
+        found["transformer_rings_z"]["released"]["all"]["low"]
+        < 3 / 27
+        < found["transformer_rings_z"]["released"]["all"]["high"]
+    )
+    assert set(found["e2e_1d"]["released"]) == set(PARTS)
+
+
+def test_results_are_found_at_any_depth_and_the_longer_counts(measured):
+    results(measured / "more" / "again", "e2e_1d.20201026", "S" * 54)
+    results(measured, "e2e_1d.20201026", "S" * 27, inference="as_released")
+    found = {r.name: r for r in find_benchmarks(measured, "navrep27")}
+    assert len(found["e2e_1d.20201026"].outcome) == 54
+    assert scores(list(found.values()))["e2e_1d"]["released"]["all"]["episodes"] == 81, "noisy runs are not drawn"
+
+
+def test_the_authors_numbers_are_those_of_the_reference(shared):
+    theirs = json.loads((shared / "reference" / "original_scores.json").read_text())["authors_figure_27_scenarios"]
+    assert {part: authors()[part] for part in PARTS} == {part: theirs[part] for part in PARTS}
+    assert "guldenring_test.png" in authors()["source"]
+    assert "Not measured by navrep-data" in authors()["what"]
+
+
+def picture(path):
+    pixels = np.asarray(Image.open(path).convert("L"))
+    assert pixels.std() > 10, "empty"
+    return pixels.shape
+
+
+@pytest.mark.slow
+def test_testing_keeps_three_sources_apart(measured):
+    done = reproduce("fig-testing", measured)
+    assert done.file == measured / "fig-testing.png"
+    picture(done.file)
+    assert {(s["name"], s["source"]) for s in done.sources if s["part"] == "all"} >= {
+        ("transformer_rings_z", "released"), ("transformer_rings_z", "ours"), ("transformer_rings_z", "authors"),
+        ("e2e_1d", "released"), ("goal", "baseline"), ("soadrl", "authors"),
+    }  # fmt: skip
+    assert json.dumps(done.to_dict())
+
+
+def test_table_has_a_column_per_source_and_the_goal_beside(measured):
+    results(measured, "transformer_rings_z.v1", "S" * 6 + "C" * 4, suite="navreptest", variant="transformer_rings_z.v1")
+    results(measured, "goal", "S" * 3 + "C" * 7, suite="navreptest")
+    done = reproduce("table", measured, measured / "t.md")
+    text = (measured / "t.md").read_text()
+    assert text == done.text
+    lines = {
+        cells[1]: cells[2:-1]
+        for line in text.split("\n## ")[0].splitlines()
+        if (cells := [c.strip() for c in line.split("|")])[1:]
+    }
+    assert lines["policy"][:3] == [
+        "authors' own figure",
+        "released weights, measured by us",
+        "our weights, measured by us",
+    ]
+    row = lines["transformer_rings_z"]
+    assert row[0] == "39.1 %"
+    assert row[1].startswith("11.1 % (")
+    assert row[2].startswith("77.8 % (")
+    assert row[3:] == ["-", "18.5 %"]
+    assert lines["e2e_1d"][1] == "50.0 % (33.3 to 66.7; 2 runs)"
+    assert "| transformer_rings_z | - | 60.0 % (" in text
+    assert "| 30.0 % |" in text
+    assert "76 %" in text
+
+
+@pytest.mark.slow
+def test_trajectories_say_whose_they_are(measured, maps):
+    done = reproduce("fig-trajectories", measured, measured / "sub" / "t.png")
+    picture(measured / "sub" / "t.png")
+    assert [s["source"] for s in done.sources] == ["ours", "released", "released", "released", "baseline"]
+
+
+def world_model(folder, name, lidar, split="train", data="d", scan=0.01):
+    curve = [scan]
+    result = WorldModelError(
+        name, split, lidar, 100, scan, 0.01, 0.005, 0.02, 0.03, 16, curve, curve, curve, curve, [10]
+    )  # fmt: skip
+    save(result, folder, {"name": "soadrl", "content_hash": data}, {})
+
+
+def test_world_models_are_compared_on_the_same_rows_only(tmp_path):
+    world_model(tmp_path, "transformer_1d.released", "1d")
+    world_model(tmp_path, "joint_1d.released", "1d", scan=0.5)
+    world_model(tmp_path, "models/mine", "rings")
+    world_model(tmp_path, "transformer_1d.v1", "1d", data="another")
+    world_model(tmp_path, "joint_1d.v1", "1d", split="val")
+    done = reproduce("fig-worldmodel", tmp_path)
+    picture(done.file)
+    assert [(s["name"], s["source"]) for s in done.sources] == [
+        ("joint_1d.released", "released"), ("transformer_1d.released", "released"), ("models/mine", "other"),
+    ]  # fmt: skip
+
+
+def test_training_curves(tmp_path):
+    for name, rates in (("a_z", [0.1, 0.4, 0.3]), ("deep/b_zh", [0.2, 0.2, 0.5])):
+        folder = tmp_path / name
+        folder.mkdir(parents=True)
+        lines = ["step,success,val_success", "50,0.5,", *(f"{100 * (i + 1)},,{r}" for i, r in enumerate(rates))]
+        (folder / "log.csv").write_text("\n".join(lines) + "\n")
+    done = reproduce("fig-training", tmp_path)
+    picture(done.file)
+    logged = [s for s in done.sources if "log" in s["source"]]
+    assert [(s["name"], s["best"], s["last"], s["steps"]) for s in logged] == [
+        ("a_z", 0.4, 0.3, 300), ("deep/b_zh", 0.5, 0.5, 300),
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_state(tmp_path):
+    tiny_dataset(tmp_path / "results" / "data")
+    done = reproduce("fig-state", tmp_path / "results")
+    picture(done.file)
+    assert done.sources[0]["name"] == "soadrl, consistent physics, seed 0"
+
+
+@pytest.mark.parametrize("figure", sorted(set(FIGURES) - {"fig-training"}))
+def test_what_is_missing_is_told_with_its_command(figure, tmp_path):
+    command = {
+        "fig-state": "navrep-data generate --env soadrl",
+        "fig-worldmodel": r"navrep-data evaluate world-model joint_1d\.released transformer_1d\.released",
+    }.get(figure, r"navrep-data benchmark e2e_1d\.released .* --suite navrep27 --out")
+    with pytest.raises(DatasetNotFoundError, match=f"has nothing for {figure}, expected results made by: {command}"):
+        reproduce(figure, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_rest_is_missing_beside_what_is_there(measured):
+    for name in ("e2e_1d.20201026", "e2e_1d.20201027", "transformer_rings_z.20201004"):
+        (measured / "navrep27-original" / f"{name}.json").unlink()
+    done = reproduce("table", measured)
+    assert any("released policies in navrep27" in m.what and "--suite navrep27" in m.command for m in done.missing)
+
+
+def test_bad_input(measured, tmp_path):
+    with pytest.raises(ConfigError, match="Did you mean 'fig-testing'"):
+        reproduce("fig-test", measured)
+    shutil.move(measured / "navrep27-original" / "goal.json", measured / "navrep27-original" / "x.json")
+    (measured / "navrep27-original" / "x.json").write_text('{"format": "other"}')
+    with pytest.raises(CorruptDataError, match="is not a results file"):
+        reproduce("table", measured)
+    assert not Path(measured / "table.md").exists()
