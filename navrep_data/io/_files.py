@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import secrets
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -82,8 +83,8 @@ def atomic_write_bytes(path: Path | str, data: bytes | memoryview) -> None:
         If the folder cannot be written.
     """
     path = Path(path)
-    # unique per process: an orphan of a killed run must never write into our temp file
-    part = path.with_name(f".{path.name}.{os.getpid()}{PART_SUFFIX}")
+    # unique, also among machines that share the folder: an orphan of a killed run must never write into our temp file
+    part = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}{PART_SUFFIX}")
     try:
         with open(part, "wb") as handle:
             handle.write(data)
