@@ -157,8 +157,9 @@ class RayCluster(Generic[Task, Result]):
                     again.append(task)
                 yield None
         finally:
-            for ref in running:
-                ray.cancel(ref, force=True)
+            if ray.is_initialized():  # the connection may have ended first
+                for ref in running:
+                    ray.cancel(ref, force=True)
 
     def _get(self, ref: Any) -> tuple[Result, str] | None:
         """Return a call's result and node, or None if its worker or node died."""

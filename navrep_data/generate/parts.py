@@ -99,9 +99,11 @@ def merge_manifest(root: Path | str, report: Callable[[str], None] | None = None
         If a listed file is not there.
     """
     root = Path(root)
+    if (root / MANIFEST_FILE).is_file():  # merged before, but perhaps not cleaned up
+        merged = Manifest.read(root)
+        shutil.rmtree(root / PARTS, ignore_errors=True)
+        return merged
     if not (root / PARTS).is_dir():
-        if (root / MANIFEST_FILE).is_file():
-            return Manifest.read(root)  # merged before
         raise DatasetNotFoundError(
             f"{root} has no folder {PARTS}, expected the --out of jobs run with `navrep-data generate --shard-range "
             "i/n`."

@@ -23,6 +23,7 @@ from navrep_data.generate.policy import PolicySpec
 from navrep_data.generate.storage import STAGING
 from navrep_data.generate.worker import DatasetSpec
 from navrep_data.io import PART_SUFFIX
+from navrep_data.io._files import MAX_JSON_BYTES
 from navrep_data.schema import COLUMNS, UINT16_RANGE_LIMIT
 from navrep_data.shards import LOCK_FILE, MANIFEST_FILE, MAX_SHARD_BYTES, Manifest, estimate_bytes
 from navrep_data.sim import RolloutSettings, SimConfig
@@ -34,6 +35,9 @@ MAX_SEQUENCES = 2**31 - 1
 MAX_LENGTH = 100_000
 # An estimate of compressed size is good to a few per cent; ask for a little more.
 DISK_MARGIN = 1.1
+# What a manifest lists: names, hashes and statistics per shard, a hash per sequence (measured: 6.1 kB and 72 bytes).
+_MANIFEST_SHARD_BYTES = 6_500
+_MANIFEST_SEQUENCE_BYTES = 75
 _GENERATED_COLUMNS = tuple(name for name in COLUMNS if not name.startswith(("leading_", "source_")))
 
 
@@ -72,6 +76,11 @@ class Request:
     def bytes(self) -> int:
         """Estimated bytes of the finished dataset, or part."""
         return int(self.rows * bytes_per_row(self.spec))
+
+
+def largest_shard(spec: DatasetSpec) -> int:
+    """Return how many sequences a shard may have: it is built in memory."""
+    return max(1, int(MAX_SHARD_BYTES / (bytes_per_row(spec) * spec.settings.length)))
 
 
 def bytes_per_row(spec: DatasetSpec) -> float:
@@ -122,7 +131,7 @@ def make_request(
         if (name != "rings" or settings.rings) and (name != "humans" or settings.humans)
     )
     spec = DatasetSpec(root, config, settings, policy, seed, columns, storage)
-    largest = max(1, int(MAX_SHARD_BYTES / (bytes_per_row(spec) * settings.length)))
+    largest = largest_shard(spec)
     if shard_size is None:
         shard_size = min(largest, max(policy.batch, DEFAULT_SHARD_ROWS // settings.length, 1))
     elif check_count("shard-size", shard_size, 1, MAX_SEQUENCES) > largest:
@@ -131,6 +140,28 @@ def make_request(
             f"built in memory and may take {MAX_SHARD_BYTES >> 20} MiB."
         )
     return Request(spec, n, shard_size, "", part)
+
+
+def check_manifest(request: Request) -> None:
+    """Refuse what would end, after days perhaps, in a manifest that is too large to be read.
+
+    Raises
+    ------
+    ConfigError
+        Naming a shard size that will do.
+    """
+    hashes = request.n * _MANIFEST_SEQUENCE_BYTES
+    if hashes - (-request.n // request.shard_size) * _MANIFEST_SHARD_BYTES <= MAX_JSON_BYTES:
+        return
+    room = (MAX_JSON_BYTES - hashes) // _MANIFEST_SHARD_BYTES
+    enough = -(-request.n // room) if room > 0 else request.n
+    todo = f"give --shard-size {enough} or more"
+    if enough > largest_shard(request.spec):
+        todo = "make several datasets, or longer sequences"
+    raise ConfigError(
+        f"{request.n:,} sequences in shards of {request.shard_size} would need a manifest larger than "
+        f"{MAX_JSON_BYTES >> 20} MiB, the most that is read: {todo}."
+    )
 
 
 def versions() -> dict[str, str]:

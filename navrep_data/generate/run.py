@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from navrep_data.errors import CorruptDataError, DatasetError, DatasetMismatchError, NavrepDataError
 from navrep_data.generate.executors import LocalExecutor, RayExecutor
-from navrep_data.generate.plan import Request, check_same, check_space, new_manifest, versions
+from navrep_data.generate.plan import Request, check_manifest, check_same, check_space, new_manifest, versions
 from navrep_data.generate.storage import check_storage, check_visible
 from navrep_data.generate.worker import ShardTask, seconds_per_row
 from navrep_data.io import PART_SUFFIX
@@ -58,6 +58,7 @@ class Run:
         else:
             check_storage(self.store)
             self.manifest = new_manifest(request)
+        check_manifest(self.request)
         self._entries = {entry.sequences: entry for entry in self.manifest.shards}
 
     def _resume(self, explicit_shard_size: bool) -> Manifest:

@@ -17,7 +17,7 @@ from navrep_data.errors import CorruptDataError, DatasetError, DiskSpaceError, F
 
 PART_SUFFIX = ".part"
 HASH_BLOCK = 1 << 20
-# A manifest of 100,000 shards is about 60 MB; anything larger is not one of ours.
+# A manifest of 35,000 shards of 20 sequences is about this large; generate refuses to make a larger one.
 MAX_JSON_BYTES = 256 << 20
 # What the operating system says when there is no room: disk full, quota used up, file size limit.
 _NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})

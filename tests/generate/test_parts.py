@@ -81,6 +81,15 @@ def test_merged_parts_are_the_dataset_of_one_run(root, whole):
     assert tree(root) == whole
 
 
+def test_a_merge_that_was_killed_while_cleaning_up(root, whole, tmp_path):
+    shutil.copytree(root / "parts" / "0001-of-00003", tmp_path / "left")
+    merge_manifest(root)
+    (root / "parts").mkdir()
+    (tmp_path / "left").rename(root / "parts" / "0001-of-00003")
+    merge_manifest(root)
+    assert tree(root) == whole
+
+
 def test_a_merged_dataset_can_be_extended(root, tmp_path):
     merge_manifest(root)
     generate(out=root, **{**SMALL, "n": 9})
