@@ -53,7 +53,7 @@ coverage: $(STAMP)  ## Line coverage of sim and observations, measured on plain 
 kill-test: $(STAMP)  ## 200 random SIGKILLs of generate (CI runs 10).
 	NAVREP_DATA_KILLS=200 $(BIN)/python -m pytest -m slow tests/generate/test_kill.py -s
 
-BENCHMARKS := run zoo envs
+BENCHMARKS := run zoo envs scale
 
 bench: $(STAMP)  ## Measure speed and size; writes benchmarks/RESULTS.md.
 	failed=0; for script in $(BENCHMARKS); do $(BIN)/python benchmarks/$$script.py --write || failed=1; done; exit $$failed

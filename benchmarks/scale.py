@@ -1,6 +1,6 @@
 """How generating scales over processes and over Ray, and what manifests of very large datasets cost.
 
-    python benchmarks/scale.py [--quick] [--json] [--write]
+    python benchmarks/scale.py [--quick] [--only scaling|manifests] [--json] [--write]
 
 The same dataset is made in turns by one and two local processes and by one and two tasks of a Ray cluster that runs
 already (one node of this machine, processes started for each run, as for the local ones). Bytes are compared too.
@@ -38,6 +38,13 @@ INTRODUCTION = """## Scaling
 
 `benchmarks/scale.py`: {n} sequences of {length:,} rows, {turns} turns; rows per second of wall time from the first task
 to the finished manifest, starting processes included, starting Ray's own daemons not. The ratio is within a turn.
+"""
+
+MANIFESTS_INTRODUCTION = """## Manifests of a billion rows
+
+{machine}
+
+`benchmarks/scale.py`: entries of a real shard, repeated.
 """
 
 
@@ -133,9 +140,36 @@ def manifest_of_a_billion(size: int, shards: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def scaling_section(n: int, turns: int) -> tuple[str, list[dict[str, Any]]]:
+    """Measure the ways of running; return text and figures."""
+    where = machine()
+    rows = scaling(n, turns)
+    text = INTRODUCTION.format(machine=describe(where), n=n, length=LENGTH, turns=turns) + "\n"
+    text += table(
+        ("run", "rows/s", "spread", "whole command, s", "compared with", "ratio"),
+        [[r["key"], number(r["median"]), f"{number(r['low'])} to {number(r['high'])}", f"{r['whole']:.1f}",
+          r["reference"] or "-", "-" if r["ratio"] is None else f"{r['ratio']:.3g}"] for r in rows],
+    )  # fmt: skip
+    return text, rows
+
+
+def manifests_section() -> tuple[str, list[dict[str, Any]]]:
+    """Measure manifests; return text and figures."""
+    where = machine()
+    rows = [run_child([Path(__file__), "--child", str(k)]) for k in range(len(MANIFESTS))]
+    text = MANIFESTS_INTRODUCTION.format(machine=describe(where)) + "\n"
+    text += table(
+        ("manifest", "MB", "merge statistics and save, s", "parse, s", "peak memory, GB"),
+        [[m["key"], f"{m['bytes'] / 1e6:.0f}", f"{m['save']:.1f}", f"{m['read']:.1f}", f"{m['peak'] / 1e9:.2f}"]
+         if "error" not in m else [m["error"], *["-"] * 4] for m in rows],
+    )  # fmt: skip
+    return text, rows
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer sequences, one turn")
+    parser.add_argument("--only", choices=("scaling", "manifests"), help="measure this alone")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the tables")
     parser.add_argument("--write", action="store_true", help="update benchmarks/RESULTS.md")
     parser.add_argument("--child", type=int, help=argparse.SUPPRESS)
@@ -143,27 +177,21 @@ def main() -> int:
     if options.child is not None:
         print(json.dumps(manifest_of_a_billion(*MANIFESTS[options.child])))
         return 0
-    n, turns = (40, 1) if options.quick else (200, 3)
-    where = machine()
-    rows = scaling(n, turns)
-    manifests = [run_child([Path(__file__), "--child", str(k)]) for k in range(len(MANIFESTS))]
-    text = INTRODUCTION.format(machine=describe(where), n=n, length=LENGTH, turns=turns) + "\n"
-    text += table(
-        ("run", "rows/s", "spread", "whole command, s", "compared with", "ratio"),
-        [[r["key"], number(r["median"]), f"{number(r['low'])} to {number(r['high'])}", f"{r['whole']:.1f}",
-          r["reference"] or "-", "-" if r["ratio"] is None else f"{r['ratio']:.3g}"] for r in rows],
-    )  # fmt: skip
-    text += "\n\nManifests of a billion rows (entries of a real shard, repeated):\n\n" + table(
-        ("manifest", "MB", "merge statistics and save, s", "parse, s", "peak memory, GB"),
-        [[m["key"], f"{m['bytes'] / 1e6:.0f}", f"{m['save']:.1f}", f"{m['read']:.1f}", f"{m['peak'] / 1e9:.2f}"]
-         if "error" not in m else [m["error"], *["-"] * 4] for m in manifests],
-    )  # fmt: skip
-    text += "\n\nMeasured with --quick: one turn, few sequences." if options.quick else ""
-    print(json.dumps({"benchmark": "scale", "machine": where, "rows": rows, "manifests": manifests})
-          if options.json else text)  # fmt: skip
-    if options.write:
-        write_section("scale.py", text)
-    return int(any("error" in m for m in manifests))
+    sizes = (20, 1) if options.quick else (60, 3)
+    sections = {}
+    if options.only != "manifests":
+        sections["scaling"] = scaling_section(*sizes)
+    if options.only != "scaling":
+        sections["manifests"] = manifests_section()
+    for name, (text, _) in sections.items():
+        if options.write:
+            write_section(f"scale.py {name}", text)
+        if not options.json:
+            print(text, end="\n\n")
+    figures = {name: rows for name, (_, rows) in sections.items()}
+    if options.json:
+        print(json.dumps({"benchmark": "scale", "quick": options.quick, **figures}))
+    return int(any("error" in row for rows in figures.values() for row in rows))
 
 
 if __name__ == "__main__":

@@ -200,7 +200,7 @@ def test_scripted_policies_extending_and_urls(nodes, tmp_path):
         generate(n=n, out=tmp_path / "there", report=lines.append, **ray, **settings)
     assert tree(tmp_path / "there") == tree(tmp_path / "here")
     assert any("on a Ray cluster, 2 tasks at a time" in line for line in lines)
-    generate(n=7, out=tmp_path / "home", storage=f"dir::file://{tmp_path}/far", **ray, **settings)
+    generate(n=7, out=tmp_path / "home", storage=f"dir://far::file://{tmp_path}", **ray, **settings)
     assert tree(tmp_path / "far") == tree(tmp_path / "here")
     assert set(tree(tmp_path / "home")) == {"manifest.json", "README.md"}
 

@@ -125,6 +125,6 @@ def test_a_place_that_refuses_is_one_line(tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_write_through_a_url(tmp_path, whole):
-    url = f"dir::file://{tmp_path}/there"
+    url = f"dir://there::file://{tmp_path}"
     generate(n=7, out=tmp_path / "d", storage=url, workers=2, **SMALL)
     assert tree(tmp_path / "there") == whole
