@@ -58,11 +58,13 @@ class Nodes:
 
         head = {"num_cpus": 0, "object_store_memory": STORE_BYTES, "include_dashboard": False, "_system_config": NOTICE}
         self.cluster = Cluster(initialize_head=True, head_node_args=head)
-        self.nodes = []
+        self.nodes, self.dead = [], []
         self.address = self.cluster.address
         self.fill()
 
     def fill(self, count=2):
+        while self.dead:  # the helper counts them among its nodes until it is told
+            self.cluster.remove_node(self.dead.pop(), allow_graceful=False)
         while len(self.nodes) < count:
             self.nodes.append(self.cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES))
         self.cluster.wait_for_nodes(timeout=60)
@@ -96,6 +98,7 @@ class Nodes:
         """The way of a machine that loses power: nothing of it says goodbye."""
         os.kill(self.raylet(node), signal.SIGKILL)
         self.nodes.remove(node)
+        self.dead.append(node)
         return node
 
     def shutdown(self):
