@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import platform
+import socket
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
@@ -21,6 +22,7 @@ LOCAL = "local"
 # Calls waiting on the cluster per processor: none goes idle between two calls, and an autoscaler sees the demand.
 QUEUED_PER_CPU = 2
 POLL_SECONDS = 0.2
+KNOCK_SECONDS = 10.0
 # Clusters grow and shrink: this often their size is looked up again.
 RESIZE_SECONDS = 5.0
 # A call that ends its worker, or loses its node, this often is at fault itself.
@@ -30,6 +32,10 @@ LOCAL_STORE_BYTES = 256 << 20
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+
+
+class _LostError(Exception):
+    """A call has no result because its worker or node died."""
 
 
 class RayCluster(Generic[Task, Result]):
@@ -79,16 +85,13 @@ class RayCluster(Generic[Task, Result]):
     def _connect(self) -> None:
         where = self.address or os.environ.get("RAY_ADDRESS") or LOCAL
         options: dict[str, Any] = {}
+        _check_reachable(where)
         if where == LOCAL:
             options = {"num_cpus": self.workers, "object_store_memory": LOCAL_STORE_BYTES, "include_dashboard": False}
         try:
             self._ray.init(address=where, log_to_driver=False, logging_level="error", **options)
         except (ConnectionError, TimeoutError, ValueError, RuntimeError) as error:
-            first = " ".join(str(error).split())[:200]
-            raise ClusterError(
-                f"No Ray cluster can be used at {where} ({first}); expected the host:port that `ray start --head` "
-                "prints, or no --address for a cluster on this machine."
-            ) from error
+            raise _no_cluster(where, error) from error
 
     @property
     def cpus(self) -> int:
@@ -143,32 +146,32 @@ class RayCluster(Generic[Task, Result]):
                     return
                 for ref in ray.wait(list(running), num_returns=1, timeout=POLL_SECONDS)[0]:
                     task = running.pop(ref)
-                    answer = self._get(ref)
-                    if answer is not None:
-                        yield task, *answer
+                    try:
+                        yield task, *self._get(ref)
                         continue
-                    deaths[task] += 1
-                    if deaths[task] > MAX_DEATHS:
-                        raise WorkerDiedError(
-                            f"Workers or nodes of the Ray cluster died {deaths[task]} times during one task (killed, "
-                            "or out of memory?). What was finished is intact; run the same command again, perhaps "
-                            "with fewer --workers."
-                        )
-                    again.append(task)
+                    except _LostError as error:
+                        deaths[task] += 1
+                        if deaths[task] > MAX_DEATHS:
+                            raise WorkerDiedError(
+                                f"Workers or nodes of the Ray cluster died {deaths[task]} times during one task (last: "
+                                f"{error}). What was finished is intact; run the same command again, perhaps with "
+                                "fewer --workers."
+                            ) from error
+                        again.append(task)
                 yield None
         finally:
             if ray.is_initialized():  # the connection may have ended first
                 for ref in running:
                     ray.cancel(ref, force=True)
 
-    def _get(self, ref: Any) -> tuple[Result, str] | None:
-        """Return a call's result and node, or None if its worker or node died."""
+    def _get(self, ref: Any) -> tuple[Result, str]:
+        """Return a call's result and node; raises _LostError if its worker or node died."""
         errors = self._ray.exceptions
         lost = (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError)
         try:
             good, value, node = self._ray.get(ref)
-        except lost:
-            return None
+        except lost as error:
+            raise _LostError(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
         except errors.RayTaskError as error:
             if isinstance(error.cause, ImportError):
                 raise ClusterError(
@@ -193,6 +196,24 @@ def _call(function: Callable[[Any, Any], Any], common: Any, task: Any, version: 
         return True, function(common, task), node
     except NavrepDataError as error:
         return False, error, node
+
+
+def _no_cluster(where: str, error: Exception) -> ClusterError:
+    return ClusterError(
+        f"No Ray cluster can be used at {where} ({' '.join(str(error).split())[:200]}); expected the host:port that "
+        "`ray start --head` prints, or no --address for a cluster on this machine."
+    )
+
+
+def _check_reachable(where: str) -> None:
+    """Knock at a host:port: Ray itself would try for minutes."""
+    host, _, port = where.rpartition("://")[2].rpartition(":")
+    if not host or not port.isdecimal():
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=KNOCK_SECONDS).close()
+    except (OSError, OverflowError) as error:
+        raise _no_cluster(where, error) from error
 
 
 def _import_ray() -> Any:

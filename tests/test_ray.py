@@ -14,6 +14,7 @@ import pytest
 
 from navrep_data._ray import RayCluster
 from navrep_data.errors import (
+    ClusterError,
     ConfigError,
     FolderNotWritableError,
     MissingExtraError,
@@ -262,15 +263,23 @@ def test_a_cluster_of_its_own_ends_with_the_run(tmp_path):
 
 @slow
 @needs_ray
-@pytest.mark.parametrize("address", ["auto", "127.0.0.1:1"])
-def test_no_cluster_there(tmp_path, monkeypatch, address):
-    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))  # where `auto` looks for one
-    words = f"generate --n 3 --executor ray --out d --address {address}"
+def test_from_the_command_line(nodes, tmp_path):
+    nodes.fill()
+    words = f"generate --n 3 --length 30 --humans 4 --obstacles 3 --executor ray --address {nodes.address} --out d"
     done = subprocess.run(
-        [sys.executable, "-m", "navrep_data", *words.split()], cwd=tmp_path, capture_output=True, text=True, timeout=200
+        [sys.executable, "-m", "navrep_data", *words.split()], cwd=tmp_path, capture_output=True, text=True, timeout=240
     )
-    assert done.returncode == 2
-    assert f"No Ray cluster can be used at {address}" in done.stderr.strip().splitlines()[-1]
+    assert done.returncode == 0, done.stderr
+    generate(n=3, length=30, humans=4, obstacles=3, out=tmp_path / "here")
+    assert tree(tmp_path / "d") == tree(tmp_path / "here")
+
+
+@needs_ray
+def test_no_cluster_there(tmp_path):
+    with pytest.raises(
+        ClusterError, match=r"No Ray cluster can be used at 127\.0\.0\.1:1 \(.*refused.*\); expected the"
+    ):
+        generate(n=3, executor="ray", address="127.0.0.1:1", out=tmp_path / "d")
     assert not (tmp_path / "d").exists()
 
 
