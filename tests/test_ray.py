@@ -61,7 +61,11 @@ class Nodes:
         self.cluster = Cluster(initialize_head=True, head_node_args=head)
         self.nodes, self.dead = [], []
         self.address = self.cluster.address
-        self.fill()
+        try:
+            self.fill()
+        except BaseException:
+            self.shutdown()
+            raise
 
     def fill(self, count=2):
         while self.dead:  # the helper counts them among its nodes until it is told
