@@ -7,7 +7,7 @@ DEMO ?= data/demo
 # test processes; 0 = all tests in one
 JOBS ?= auto
 
-.PHONY: help install demo test check format bench bench-peers test-nojit test-boundscheck coverage kill-test wheel clean
+.PHONY: help install demo test check format bench bench-peers test-nojit test-boundscheck coverage kill-test docs wheel clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 20
@@ -62,9 +62,13 @@ bench-peers: $(STAMP)  ## Measure other simulators beside ours; writes benchmark
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev,peers]"
 	$(BIN)/python benchmarks/peers.py --write
 
+docs: $(STAMP)  ## Build the documentation site into site/; any warning is an error.
+	rm -rf site
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --fresh-env -d build/doctrees -b html docs site
+
 wheel: $(STAMP)  ## Build the wheel into dist/.
 	rm -rf dist
 	$(BIN)/python -m build --wheel --outdir dist .
 
 clean:  ## Remove the virtual environment and everything built.
-	rm -rf $(VENV) dist build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .coverage*
+	rm -rf $(VENV) dist build site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .coverage*

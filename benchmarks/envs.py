@@ -29,14 +29,14 @@ SETTINGS = {"NavRepTrain-v0": {"curriculum": "constant"}}
 ALWAYS = ("NavRepTrain-v0", "NavRepTest-v0", "SOADRL-v0")
 SEEDS = 64
 HEADER = ("environment", "worlds", "vectorised, steps/s", "spread", "per wall s", "must", "verdict", "singly, steps/s",
-          "ratio", "reset, ms")  # fmt: skip
+          "ratio", "reset, ms", "must")  # fmt: skip
 INTRODUCTION = """## Environments
 
 {machine}
 
 `benchmarks/envs.py`: steps per second of CPU time of one core under random actions, scans, infos and automatic resets
 included (NavRepTrain at its greatest difficulty); singly = the same environment, one world, in turns. Reset = of a
-single environment, median.
+single environment, median. The verdict is on both.
 """
 
 
@@ -114,18 +114,18 @@ def measure(name: str, worlds: int, repeats: int, seconds: float) -> dict[str, A
         "key": name, "worlds": worlds, "value": figures["median"], "low": figures["low"], "high": figures["high"],
         "wall": spread(many.wall)["median"], "must": MUST.get(name), "verdict": ("FAIL" if slow else "pass") if asked
         else "-", "reference": "single environment", "reference_value": spread(one.cpu)["median"],
-        "ratio": ratio(many.cpu, one.cpu), "reset": reset,
+        "ratio": ratio(many.cpu, one.cpu), "reset": reset, "must_reset": MUST_RESET.get(name),
     }  # fmt: skip
 
 
 def cells(row: dict[str, Any]) -> list[str]:
     """Return a row as the cells of the table."""
     if "error" in row:
-        return [row["key"], row["error"], *["-"] * 4, "FAIL", *["-"] * 3]
+        return [row["key"], row["error"], *["-"] * 4, "FAIL", *["-"] * 4]
     return [
         row["key"], str(row["worlds"]), number(row["value"]), f"{number(row['low'])} to {number(row['high'])}",
         number(row["wall"]), number(row["must"]), row["verdict"], number(row["reference_value"]),
-        f"{row['ratio']:.3g}", f"{1e3 * row['reset']:.2f}",
+        f"{row['ratio']:.3g}", f"{1e3 * row['reset']:.2f}", number(row["must_reset"] and 1e3 * row["must_reset"]),
     ]  # fmt: skip
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import typer
@@ -30,3 +32,17 @@ def print_json(value: Any) -> None:
 def show_progress() -> bool:
     """Return whether somebody watches stderr."""
     return sys.stderr.isatty()
+
+
+@contextlib.contextmanager
+def progress_bar(unit: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield what is called with (done, total) to move a bar on stderr, where somebody watches it."""
+    from tqdm import tqdm
+
+    with tqdm(unit=unit, disable=not show_progress()) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show

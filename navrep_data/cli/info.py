@@ -39,6 +39,8 @@ def _print_info(root: Path, found: dict[str, Any]) -> None:
     origin = found["origin"]
     if origin is not None:
         say(f"from: {origin['repo']} at commit {origin['commit']} ({origin['endpoint']})")
+    for record in found["source"] or ():
+        say(f"made out of: {record.get('name', 'a dataset')}, content {record['content_hash']}")
     say(f"content: {found['content_hash']}" + (f", licence {found['license']}" if found["license"] else ""))
     say("splits: " + ", ".join(f"{name} {count}" for name, count in found["splits"].items()))
     say("columns: " + ", ".join(found["columns"]))

@@ -20,6 +20,7 @@ from navrep_data.cli import (
     merge_manifest,
     models,
     play,
+    tools,
     train,
     verify,
     view,
@@ -41,6 +42,13 @@ app.command("benchmark")(benchmark.benchmark_command)
 app.command("info")(info.info_command)
 app.command("verify")(verify.verify_command)
 app.command("import-npz")(import_npz.import_npz_command)
+app.command("import-rosbag")(tools.import_rosbag_command)
+app.command("merge")(tools.merge_command)
+app.command("split")(tools.split_command)
+app.command("filter")(tools.filter_command)
+app.command("stats")(tools.stats_command)
+app.command("sample")(tools.sample_command)
+app.command("export")(tools.export_command)
 app.command("play")(play.play_command)
 app.command("push")(hub.push_command)
 app.command("pull")(hub.pull_command)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from navrep_data.cli._common import print_json, say, show_progress
+from navrep_data.cli._common import print_json, progress_bar, say
 
 
 def verify_command(
@@ -19,16 +19,9 @@ def verify_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Check every file of a dataset: hashes, schema, index, ranges, rings. Exits 1 if anything is wrong."""
-    from tqdm import tqdm
-
     from navrep_data.shards import verify
 
-    with tqdm(unit="shard", disable=not show_progress()) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with progress_bar("shard") as show:
         report = verify(root, progress=show)
     again = None
     if regenerate is not None and report.ok:

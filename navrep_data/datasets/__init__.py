@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from navrep_data.datasets.latents import LatentDataset
     from navrep_data.datasets.loading import make_loader
     from navrep_data.datasets.npz import import_npz
+    from navrep_data.datasets.rosbag import import_rosbag
     from navrep_data.datasets.scans import ScanDataset
     from navrep_data.datasets.sequences import SequenceDataset
     from navrep_data.datasets.streaming import StreamingSequenceDataset
@@ -25,6 +26,7 @@ _HOMES = {
     "SequenceDataset": "sequences",
     "StreamingSequenceDataset": "streaming",
     "import_npz": "npz",
+    "import_rosbag": "rosbag",
     "make_loader": "loading",
     "pull": "hub",
     "push": "hub",
@@ -37,6 +39,7 @@ __all__ = [
     "SequenceDataset",
     "StreamingSequenceDataset",
     "import_npz",
+    "import_rosbag",
     "make_loader",
     "pull",
     "push",

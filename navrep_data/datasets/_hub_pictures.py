@@ -1,4 +1,4 @@
-"""A picture and a moving one of a dataset, drawn from its own rows, for its card."""
+"""Pictures of a dataset, drawn from its own rows: a still and a moving one for its card, any row for a sample."""
 
 from __future__ import annotations
 
@@ -28,17 +28,18 @@ Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
-class _Episode:
-    """The rows of one episode, and what stood around."""
+class Episode:
+    """The rows of one episode, and what stood around, None where that is not known."""
 
     rows: dict[str, Array]
-    world: EpisodeWorld
+    world: EpisodeWorld | None
     folder: DatasetFolder
 
     def __len__(self) -> int:
         return len(self.rows["scan"])
 
     def draw_world(self, axes: Any, row: int) -> None:
+        assert self.world is not None
         border = self.world.border
         pose = self.rows["robot_pose"][row]
         draw_world(
@@ -67,12 +68,13 @@ def draw_pictures(folder: DatasetFolder) -> dict[str, bytes]:
     if episode is None:
         return {}
     name = "".join(c if c.isalnum() else "-" for c in folder.manifest.env)[:80]
-    return {f"media/{name}-episode.gif": _moving(episode), f"media/{name}-scene.png": _still(episode)}
+    row = int(_SHARE * (len(episode) - 1))
+    return {f"media/{name}-episode.gif": _moving(episode), f"media/{name}-scene.png": still(episode, row)}
 
 
-def _choose(folder: DatasetFolder) -> _Episode | None:
+def _choose(folder: DatasetFolder) -> Episode | None:
     """Return the longest of the first episodes that reached its goal, or of all if none did."""
-    if not set(_NEEDED) <= set(folder.manifest.columns) or folder.manifest.sensor.n_rays < 2:
+    if folder.manifest.sensor.n_rays < 2:
         return None
     e = folder.episodes
     looked = np.arange(min(len(e), _EPISODES_LOOKED_AT))
@@ -80,15 +82,19 @@ def _choose(folder: DatasetFolder) -> _Episode | None:
     candidates = reached if len(reached) else looked
     if not len(candidates):
         return None
-    k = int(candidates[np.argmax(e.length[candidates])])
+    episode = read_episode(folder, int(candidates[np.argmax(e.length[candidates])]))
+    return None if episode.world is None else episode
+
+
+def read_episode(folder: DatasetFolder, k: int) -> Episode:
+    """Return episode `k` of ``folder.episodes``, without a world where not all is stored that drawing it needs."""
+    e = folder.episodes
     shard, start, stop = int(e.shard[k]), int(e.start[k]), int(e.start[k] + e.length[k])
-    worlds = folder.worlds(shard)
-    if worlds is None:
-        return None
-    rows = {column: folder.read(column, shard, start, stop) for column in _NEEDED}
-    if not np.isfinite(rows["robot_pose"]).all():  # imports do not know it
-        return None
-    return _Episode(rows, worlds.episode(int(np.flatnonzero(worlds.arrays["row"] == start)[0])), folder)
+    rows = {name: folder.read(name, shard, start, stop) for name in _NEEDED if name in folder.manifest.columns}
+    worlds = folder.worlds(shard) if set(_NEEDED) <= set(rows) else None
+    if worlds is None or not np.isfinite(rows["robot_pose"]).all():  # imports do not know it
+        return Episode(rows, None, folder)
+    return Episode(rows, worlds.episode(int(np.flatnonzero(worlds.arrays["row"] == start)[0])), folder)
 
 
 def _to_world(humans: Array, pose: Array) -> Array:
@@ -111,13 +117,17 @@ def _figure(width: float, height: float, mosaic: str, dpi: int, ratios: tuple[fl
     return figure, figure.subplot_mosaic(mosaic, width_ratios=list(ratios))
 
 
-def _still(episode: _Episode) -> bytes:
-    row = int(_SHARE * (len(episode) - 1))
-    figure, axes = _figure(11, 6, "WS;WR", 100, (1.15, 1.0))
-    episode.draw_world(axes["W"], row)
-    axes["W"].set_title("world: robot (red), humans (pale: not in sight), goal (star)", fontsize=10)
-    draw_scan(axes["S"], episode.metres(row), episode.folder.manifest.sensor)
-    axes["S"].set_title(f"scan: {episode.folder.manifest.sensor.n_rays} ranges", fontsize=10)
+def still(episode: Episode, row: int) -> bytes:
+    """Return a PNG of one row: its world (if known), scan and rings."""
+    sensor = episode.folder.manifest.sensor
+    if episode.world is not None:
+        figure, axes = _figure(11, 6, "WS;WR", 100, (1.15, 1.0))
+        episode.draw_world(axes["W"], row)
+        axes["W"].set_title("world: robot (red), humans (pale: not in sight), goal (star)", fontsize=10)
+    else:
+        figure, axes = _figure(11, 4, "SR", 100, (1.0, 1.0))
+    draw_scan(axes["S"], episode.metres(row), sensor)
+    axes["S"].set_title(f"scan: {sensor.n_rays} ranges", fontsize=10)
     draw_rings(axes["R"], episode.rings(row))
     axes["R"].set_title("rings: 64 x 64, white free, grey unknown, dark occupied", fontsize=10)
     buffer = io.BytesIO()
@@ -125,9 +135,10 @@ def _still(episode: _Episode) -> bytes:
     return buffer.getvalue()
 
 
-def _frames(episode: _Episode) -> Iterator[Any]:
+def _frames(episode: Episode) -> Iterator[Any]:
     from PIL import Image
 
+    assert episode.world is not None
     figure, axes = _figure(6.4, 3.2, "WR", 80, (1.0, 1.0))
     points = np.concatenate([np.asarray(p) for p in (*episode.world.polygons, episode.rows["robot_pose"][:, :2])])
     if episode.world.border is not None:
@@ -145,7 +156,7 @@ def _frames(episode: _Episode) -> Iterator[Any]:
         yield Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
 
 
-def _moving(episode: _Episode) -> bytes:
+def _moving(episode: Episode) -> bytes:
     from PIL import Image
 
     frames = list(_frames(episode))

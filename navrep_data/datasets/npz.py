@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import platform
-import shutil
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Sequence
@@ -21,9 +20,8 @@ from navrep_data.errors import (
     CorruptDataError,
     DatasetError,
     DatasetNotFoundError,
-    FolderInUseError,
 )
-from navrep_data.io import sha256_file
+from navrep_data.io import new_folder, sha256_file
 from navrep_data.observations import scan_to_rings
 from navrep_data.schema import (
     ACTION_SIZE,
@@ -153,7 +151,19 @@ def _clean_scans(scans: npt.NDArray[Any], range_max: float, path: Path) -> npt.N
     return scans
 
 
-def align(arrays: Arrays, sequence: int) -> Arrays:
+def unplayed_frames(dones: npt.NDArray[Any], actions: npt.NDArray[Any], rewards: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return which rows are frames of episodes that were never played: done, with zero action and reward.
+
+    Parameters
+    ----------
+    dones, actions, rewards : ndarray of shape (N,), (N, 3), (N,)
+        As the original stores them.
+    """
+    unplayed: npt.NDArray[np.bool_] = dones & (actions == 0).all(1) & (rewards == 0)
+    return unplayed
+
+
+def align(arrays: Arrays, sequence: int, timeout_rows: int | None = TIMEOUT_ROWS) -> Arrays:
     """Turn rows of the original into rows of this package, without scans and rings.
 
     Parameters
@@ -163,6 +173,8 @@ def align(arrays: Arrays, sequence: int) -> Arrays:
         them.
     sequence : int
         Index of the sequence in the dataset.
+    timeout_rows : int, optional
+        Rows after which an episode has run out of time; None where there is no such limit.
 
     Returns
     -------
@@ -177,7 +189,7 @@ def align(arrays: Arrays, sequence: int) -> Arrays:
     n = len(dones)
     # A frame of an episode that was never played stands where the robot was stuck; the row before it is the
     # real end.
-    unplayed = dones & (actions == 0).all(1) & (rewards == 0)
+    unplayed = unplayed_frames(dones, actions, rewards)
     ended = dones.copy()
     ended[-1] = True
     given_up = np.zeros(n, bool)
@@ -189,7 +201,8 @@ def align(arrays: Arrays, sequence: int) -> Arrays:
 
     event = np.zeros(n, np.uint8)
     event[is_last] = Event.CUT
-    event[dones & (step + 1 == TIMEOUT_ROWS)] = Event.TIMEOUT
+    if timeout_rows is not None:
+        event[dones & (step + 1 == timeout_rows)] = Event.TIMEOUT
     event[dones & (rewards == GOAL_REWARD)] = Event.GOAL
     event[dones & (rewards == COLLISION_REWARD)] = Event.COLLISION_OBSTACLE
     event[given_up] = Event.STUCK
@@ -295,32 +308,13 @@ def import_npz(
     Events follow from rewards: 100 goal, -25 ``collision_obstacle`` (the source does not tell humans from
     obstacles), done on row 176 ``timeout``, anything else ``cut``.
     """
-    out = Path(out)
     files = _find(source)
     if not (math.isfinite(range_max) and range_max > 0 and math.isfinite(dt) and dt > 0):
         raise ConfigError(f"range_max is {range_max} m and dt {dt} s, expected positive numbers.")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FolderInUseError(
-            f"{out} is in use, expected a new or empty folder: an import never overwrites. Choose another."
-        )
-    # Everything is made beside the target and renamed at the end, so `out` is either complete or as it was.
-    part = out.with_name(out.name + ".part")
-    if part.exists():
-        raise FolderInUseError(
-            f"{part} exists, left by an import that was interrupted or still runs. Remove it if none runs."
-        )
-    lengths = [_load(path, read=False)[0] for path in files]
-    manifest = _plan(files, lengths, env, SensorContract(range_max=float(range_max), dt=float(dt)), rings)
-    try:
-        (part / "data").mkdir(parents=True)
-        manifest = _write(part, manifest, files, range_max, rings, progress)
-        if out.exists():
-            out.rmdir()
-        part.rename(out)
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
-    return manifest
+    with new_folder(out, what="an import") as part:
+        lengths = [_load(path, read=False)[0] for path in files]
+        manifest = _plan(files, lengths, env, SensorContract(range_max=float(range_max), dt=float(dt)), rings)
+        return _write(part, manifest, files, range_max, rings, progress)
 
 
 def _plan(files: Sequence[Path], lengths: Sequence[int], env: str, sensor: SensorContract, rings: bool) -> Manifest:

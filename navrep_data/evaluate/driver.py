@@ -38,7 +38,7 @@ class Benchmark:
     Attributes
     ----------
     rows : list of dict
-        One per policy, in the order asked for; see :func:`navrep_data.evaluate.scores.summary`.
+        One per policy, in the order asked for; see :func:`navrep_data.evaluate.summary`.
     variants : list of dict
         Variants of which several runs were played.
     baseline : dict
@@ -116,7 +116,7 @@ def benchmark(
     address : str, optional
         The Ray cluster's ``host:port``, or ``auto``; by default ``RAY_ADDRESS``, or a cluster on this machine alone.
     progress : callable, optional
-        See :data:`Progress`.
+        Called with a policy's name, how many of its episodes are finished, and of how many.
 
     Returns
     -------

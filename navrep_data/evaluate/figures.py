@@ -59,10 +59,14 @@ def draw(
 
 
 def _save(figure: Any, path: Path) -> Path:
-    buffer = io.BytesIO()
-    # without the version of matplotlib in it, so that the same results give the same bytes
-    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
-    atomic_write_bytes(path, buffer.getvalue())
+    from PIL import Image
+
+    drawn, packed = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=DPI)
+    # a palette halves the size; and nothing of matplotlib's version is in it, so that equal results give equal bytes
+    picture = Image.open(drawn).convert("RGB")
+    picture.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(packed, "png", optimize=True)
+    atomic_write_bytes(path, packed.getvalue())
     return path
 
 
@@ -111,7 +115,11 @@ def bars(rows: Sequence[Row], groups: Sequence[Row], baseline: Row) -> Any:
             ax.bar(i, value, color=PALETTE[i % len(PALETTE)], width=0.75, zorder=2)
             error = [[max(0.0, value - low)], [max(0.0, high - value)]]
             ax.errorbar(i, value, error, color="black", capsize=3, linewidth=1, zorder=3)
-            ax.annotate(f"{value:.0f}", (i, high), (0, 2), textcoords="offset points", ha="center", fontsize=8)
+            # on white, since the dashed line may pass behind it
+            white = {"boxstyle": "square,pad=0.05", "facecolor": "white", "edgecolor": "none"}
+            ax.annotate(
+                f"{value:.0f}", (i, high), (0, 3), textcoords="offset points", ha="center", fontsize=8, bbox=white
+            )
         level = (baseline if part is None else baseline["per_map"][part])["success_rate"]
         if level is not None:
             ax.axhline(100 * level, color="black", linestyle="--", linewidth=0.8, zorder=1, label="goal")
@@ -127,7 +135,7 @@ def bars(rows: Sequence[Row], groups: Sequence[Row], baseline: Row) -> Any:
     axes[0].legend(loc="upper left", fontsize=7, frameon=False)
     row = rows[0]
     figure.suptitle(f"{row['suite']}, {row['physics']} physics, {row['episodes']:,} episodes per policy", fontsize=10)
-    note = "Bars: 95 % intervals (Wilson)" + ("; several runs: least to greatest" if groups else "")
+    note = "Whiskers: 95 % intervals (Wilson)" + ("; several runs: least to greatest" if groups else "")
     figure.supxlabel(f"{note}. Dashed: straight to the goal.", fontsize=7)
     return figure
 
@@ -146,7 +154,27 @@ def _paths(ax: Any, results: Results, episodes: Sequence[int], linewidth: float 
                 ax.plot(*xy[-1], markersize=3.5, markeredgewidth=0.9, zorder=5, **end)
 
 
-def _overlaid(ax: Any, results: Results, episodes: Sequence[int], size: float = 9) -> None:
+CORNERS = (("right", "bottom"), ("left", "bottom"), ("right", "top"), ("left", "top"))
+CORNER_SHARE = (0.45, 0.22)
+"""Width and height that a written success takes of a panel."""
+
+
+def _free_corner(frame: Sequence[float], marks: Any, lines: Any) -> tuple[str, str]:
+    """Return the corner of a panel where least is drawn; marks, (n, 2), count more than points of lines, (m, 2)."""
+    x0, x1, y0, y1 = frame
+    weight = np.concatenate([np.full(len(marks), 1000.0), np.ones(len(lines))])
+    x, y = ((np.concatenate([marks, lines]) - (x0, y0)) / (x1 - x0, y1 - y0)).T
+    taken = []
+    for side, end in CORNERS:
+        near_x = x > 1.0 - CORNER_SHARE[0] if side == "right" else x < CORNER_SHARE[0]
+        near_y = y > 1.0 - CORNER_SHARE[1] if end == "top" else y < CORNER_SHARE[1]
+        taken.append(float(weight[near_x & near_y].sum()))
+    return CORNERS[taken.index(min(taken))]
+
+
+def _overlaid(
+    ax: Any, results: Results, episodes: Sequence[int], size: float = 9, corner: tuple[str, str] = CORNERS[0]
+) -> None:
     """Write the success in percent over a panel; its interval below, where there is room."""
     played = [k for k in episodes if k < len(results.outcome) and results.outcome[k] in OUTCOMES]
     if not played:
@@ -157,7 +185,8 @@ def _overlaid(ax: Any, results: Results, episodes: Sequence[int], size: float = 
     if size > 8:
         text += f"\n({low:.0f} to {high:.0f})"
     box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-    ax.text(0.97, 0.03, text, transform=ax.transAxes, ha="right", va="bottom", fontsize=size, bbox=box, zorder=6)
+    x, y = (0.97 if corner[0] == "right" else 0.03), (0.97 if corner[1] == "top" else 0.03)
+    ax.text(x, y, text, transform=ax.transAxes, ha=corner[0], va=corner[1], fontsize=size, bbox=box, zorder=8)
 
 
 def _legend(figure: Any) -> None:
@@ -234,8 +263,18 @@ def _frame(scene: Backdrop, paths: Sequence[Any]) -> tuple[float, float, float, 
     """Return a square (x0, x1, y0, y1) around everything that a panel shows."""
     points = np.concatenate([scene.start[None], scene.goal[None], scene.humans, *paths])
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    half = max(2.5, 0.5 * float(np.ptp(points, axis=0).max()) + 1.0)
+    # wide enough that marks at the edge are whole
+    half = max(2.5, 0.54 * float(np.ptp(points, axis=0).max()) + 1.0)
     return centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half
+
+
+def _marks(scene: Backdrop) -> Any:
+    """Return the places that must not be written over, (n, 2)."""
+    return np.stack([scene.start, scene.goal])
+
+
+def _joined(paths: Sequence[Any]) -> Any:
+    return np.concatenate([np.zeros((0, 2)), *paths])
 
 
 def _episodes(results: Results, scenario: int) -> list[int]:
@@ -255,9 +294,10 @@ def grid(results: Results) -> Any:
         episodes = _episodes(results, i)
         scene = backdrop(suite.scenarios[i].name)
         stored = [results.trajectories[k] for k in episodes if k in results.trajectories]
-        _scene(ax, scene, _frame(scene, stored))
+        frame = _frame(scene, stored)
+        _scene(ax, scene, frame)
         _paths(ax, results, episodes)
-        _overlaid(ax, results, episodes, 8)
+        _overlaid(ax, results, episodes, 8, _free_corner(frame, _marks(scene), _joined(stored)))
         ax.set_title(suite.scenarios[i].name, fontsize=6.5)
     figure.suptitle(f"{results.name}: {suite.name}, {results.physics} physics", fontsize=10, x=0.01, ha="left")
     figure.supxlabel(_NOTE, fontsize=7)
@@ -266,8 +306,8 @@ def grid(results: Results) -> Any:
 
 
 _NOTE = (
-    "Dot: start, star: goal, circles: where humans start (dark: those that walk). Maps: asl-pepper-2d-sim, which "
-    "states no licence."
+    "Lines: a scenario's first 20 episodes. Per cent: success over all its episodes. Dot: start, star: goal, circles: "
+    "where humans start (dark: those that walk).\nMaps: asl-pepper-2d-sim, which states no licence."
 )
 
 
@@ -282,11 +322,12 @@ def comparison(found: Sequence[Results]) -> Any:
         scene = backdrop(name)
         stored = [r.trajectories[k] for r in found for k in _episodes(r, i) if k in r.trajectories]
         frame = _frame(scene, stored)
+        corner = _free_corner(frame, _marks(scene), _joined(stored))
         for ax, results in zip(axes[:, column], found, strict=True):
             _scene(ax, scene, frame)
             episodes = _episodes(results, i)
             _paths(ax, results, episodes)
-            _overlaid(ax, results, episodes)
+            _overlaid(ax, results, episodes, corner=corner)
         axes[0, column].set_title(f"{name}\n({MAP_GROUPS[suite.scenarios[i].map]} map)", fontsize=7.5)
     for ax, results in zip(axes[:, 0], found, strict=True):
         ax.set_ylabel(results.name, fontsize=7)

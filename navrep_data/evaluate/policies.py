@@ -56,7 +56,7 @@ class PilotSpec:
         if self.kind == "baseline":
             return BASELINES[self.name]()
         if self.kind == "function":
-            return FunctionPilot(self.name, self.function or load_callable(self.name))
+            return FunctionPilot(self.name, self.function or load_callable(self.name, BASELINES))
         import torch
 
         from navrep_data.zoo import load
@@ -103,7 +103,7 @@ def resolve_policy(
         pilot = BASELINES[policy]
         return PilotSpec(policy, (on_maps and pilot.sees_on_maps) or pilot.sees, policy, "baseline")
     if ":" in policy:
-        return PilotSpec(policy, "scan", policy, "function", files=_hashes(load_callable(policy)))
+        return PilotSpec(policy, "scan", policy, "function", files=_hashes(load_callable(policy, BASELINES)))
     return _from_zoo(policy, None if source is None else os.fspath(source), inference)
 
 

@@ -44,7 +44,7 @@ class Results:
     Attributes
     ----------
     outcome : list of str
-        A letter per episode, see :data:`LETTERS`.
+        A letter per episode: S goal, T timeout, C any collision, - not played.
     events : list of str
         Name of the event per episode, empty where it was not played.
     steps : list of int

@@ -51,7 +51,7 @@ def overall(rows: Sequence[Row], baseline: Row | None) -> str:
     Parameters
     ----------
     rows : sequence of dict
-        What :func:`navrep_data.evaluate.scores.summary` returns.
+        What :func:`navrep_data.evaluate.summary` returns.
     baseline : dict or None
         The same of `goal`.
     """

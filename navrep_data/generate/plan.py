@@ -248,6 +248,11 @@ def check_same(old: Manifest, request: Request, explicit_shard_size: bool) -> No
     DatasetMismatchError
         Naming the first field that differs.
     """
+    if old.source:
+        raise DatasetMismatchError(
+            f"{request.spec.root} was made out of other datasets ({old.command}), so generate cannot go on with it; "
+            "choose another --out."
+        )
     new = new_manifest(request)
     pairs: list[tuple[str, Any, Any]] = [
         ("env", old.env, new.env),

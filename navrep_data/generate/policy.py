@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,8 +73,15 @@ def make_policy(policy: str | PolicyFunction, batch: int) -> PolicySpec:
     return PolicySpec(ScriptedPolicy(policy).name)
 
 
-def load_callable(name: str) -> PolicyFunction:
+def load_callable(name: str, others: Iterable[str] = SCRIPTED) -> PolicyFunction:
     """Import ``module:attribute``; the current folder is searched first, as ``python -m`` does.
+
+    Parameters
+    ----------
+    name : str
+        ``module:attribute``.
+    others : iterable of str
+        Names that the error offers instead.
 
     Raises
     ------
@@ -91,7 +99,7 @@ def load_callable(name: str) -> PolicyFunction:
     except (ImportError, AttributeError, ValueError) as error:
         raise PolicyError(
             f"Policy {name!r} cannot be imported ({error}). Expected module:function, importable from {here}, or one "
-            f"of: {', '.join(SCRIPTED)}."
+            f"of: {', '.join(others)}."
         ) from error
     if isinstance(found, type):
         found = found()

@@ -81,6 +81,8 @@ def recipe_of(root: Path, manifest: Manifest) -> DatasetSpec:
     ConfigError, PolicyError
         If this version cannot simulate it, or its policy cannot be imported.
     """
+    if manifest.source:
+        raise DatasetError(f"{root} was made out of other datasets ({manifest.command}); regenerate from those.")
     if "name" not in manifest.policy or "env" not in manifest.config:
         raise DatasetError(f"{root} was not made by `navrep-data generate`; there is no recipe to make it again from.")
     config = SimConfig.from_dict(manifest.config)

@@ -14,6 +14,7 @@ from navrep_data.io._files import (
     translate_os_error,
 )
 from navrep_data.io.download import FileId, download, git_blob_sha1, is_offline, switched_off
+from navrep_data.io.folders import new_folder
 
 __all__ = [
     "PART_SUFFIX",
@@ -26,6 +27,7 @@ __all__ = [
     "git_blob_sha1",
     "is_offline",
     "json_bytes",
+    "new_folder",
     "read_json",
     "safe_join",
     "sha256_bytes",

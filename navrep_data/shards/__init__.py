@@ -9,6 +9,7 @@ from navrep_data.shards.entries import (
     FileEntry,
     ShardEntry,
     default_splits,
+    ranges_of,
     shard_file,
     split_of,
     worlds_file,
@@ -19,9 +20,10 @@ from navrep_data.shards.manifest import CARD_FILE, MANIFEST_FILE, Manifest
 from navrep_data.shards.origin import ORIGIN_FILE, REPO_NAME, Origin, read_origin
 from navrep_data.shards.reader import Shard
 from navrep_data.shards.recipe import ShardRecipe, read_recipe
+from navrep_data.shards.source import SequenceSource
 from navrep_data.shards.statistics import merge_statistics
-from navrep_data.shards.verify import Problem, VerifyReport, verify
-from navrep_data.shards.worlds import WORLD_FIELDS, EpisodeWorld, Worlds, read_worlds
+from navrep_data.shards.verify import Problem, VerifyReport, check_file, verify
+from navrep_data.shards.worlds import WORLD_FIELDS, EpisodeWorld, Worlds, read_worlds, take_episodes
 from navrep_data.shards.writer import MAX_SHARD_BYTES, ShardImage, ShardWriter, publish, sequence_hash
 
 __all__ = [
@@ -41,6 +43,7 @@ __all__ = [
     "Manifest",
     "Origin",
     "Problem",
+    "SequenceSource",
     "Shard",
     "ShardEntry",
     "ShardImage",
@@ -48,6 +51,7 @@ __all__ = [
     "ShardWriter",
     "VerifyReport",
     "Worlds",
+    "check_file",
     "choose_shards",
     "chunk_rows",
     "column_order",
@@ -59,6 +63,7 @@ __all__ = [
     "info",
     "merge_statistics",
     "publish",
+    "ranges_of",
     "read_origin",
     "read_recipe",
     "read_worlds",
@@ -66,6 +71,7 @@ __all__ = [
     "sequence_hash",
     "shard_file",
     "split_of",
+    "take_episodes",
     "verify",
     "worlds_file",
     "writer_lock",

@@ -16,6 +16,20 @@ _MAX_LISTED = 1000
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 _SIZES_LARGE = ((10_000_000, "1M<n<10M"), (100_000_000, "10M<n<100M"), (1_000_000_000, "100M<n<1B"))
 
+_HUMANS = {
+    "orca": "humans that follow ORCA",
+    "planned": "humans that follow the shortest way round walls",
+    "static": "humans that stand still",
+    "constant-velocity": "humans that walk straight on",
+}
+# By name in the package asl-pepper-2d-sim; scenarios lie on three of them. Named here so that a card is a function of
+# its manifest alone, wherever it is made.
+_PAPER_MAPS = frozenset(
+    {"asl", "asl_office_j", "cla_glass_hall", "empty", "hg_main_hall", "openlab_office_j", "unity_scene_map"}
+    | {"original_ckk", "scrubbed_ckk", *(f"crowdmove{k}" for k in range(1, 7)), *(f"marktm{k}" for k in range(1, 4))}
+    | {"markclutter", "markcomplex", "markmaze", "marksimple", "marktrain"}
+)
+
 CITATION = """\
 @article{dugas2020navrep,
   title   = {NavRep: Unsupervised Representations for Reinforcement Learning
@@ -135,6 +149,18 @@ def _pictures(m: Manifest) -> str:
     return "\n".join([*lines, ""]) if lines else ""
 
 
+def _maps_note(m: Manifest) -> str:
+    """Say whose maps the worlds lie on; empty where there are none of the paper's."""
+    maps = m.config.get("maps")
+    named = isinstance(maps, list) and any(isinstance(name, str) and name in _PAPER_MAPS for name in maps)
+    if not named and not m.config.get("scenarios"):
+        return ""
+    return (
+        "The maps are those of the package `asl-pepper-2d-sim`, which states no licence: the licence of this dataset\n"
+        "does not cover them. No map file is part of it, but scans and pictures show where walls are.\n\n"
+    )
+
+
 def _lead(m: Manifest) -> str:
     return _part(m) + _pictures(m)
 
@@ -148,8 +174,32 @@ def _part(m: Manifest) -> str:
     )
 
 
+def _seed(m: Manifest) -> str:
+    return f"made out of {len(m.source)} datasets" if len(m.source) > 1 else f"seed {m.seed}"
+
+
+def _length(m: Manifest) -> str:
+    return f"at most {m.length:,}" if m.source else f"{m.length:,}"
+
+
+def _sources(m: Manifest) -> str:
+    """Return the lines that name the datasets that this one was made out of."""
+    if not m.source:
+        return ""
+    lines = [f"* {record.get('name', 'a dataset')}: content `{record['content_hash']}`" for record in m.source]
+    return "\n".join(
+        ["Made out of:\n", *lines, "", "Which sequence and row is where: `source` in `manifest.json`.\n", ""]
+    )
+
+
 def _limits(m: Manifest) -> str:
-    lines = ["* Simulated: flat ground, a planar lidar without noise, humans that follow ORCA."]
+    # of several datasets made into one, `config` has what they share; what differs is with each
+    configs = [c if isinstance(c := record.get("config"), dict) else m.config for record in m.source] or [m.config]
+    noise = "with noise" if any(c.get("scan_noise") or c.get("scan_dropout") for c in configs) else "without noise"
+    walks = [_HUMANS.get(str(c.get("human_policy", "orca")), "humans that follow a script") for c in configs]
+    lines = [f"* Simulated: flat ground, a planar lidar {noise}, {' or '.join(dict.fromkeys(walks))}."]
+    if m.physics == "recorded":
+        lines = ["* Recorded with a robot: people, obstacles and the robot's radius are not known."]
     if m.scan_dtype == "uint16":
         lines.append(
             "* Scans are rounded to millimetres: about 1 frame in 8 has one rings cell one bin off that of float32."
@@ -192,12 +242,12 @@ def dataset_card(manifest: Manifest) -> str:
 
 # navrep-data: {m.env}
 
-{_lead(m)}{m.rows:,} steps of a robot among humans, in {m.sequences:,} sequences of {m.length:,} steps: lidar
+{_lead(m)}{m.rows:,} steps of a robot among humans, in {m.sequences:,} sequences of {_length(m)} steps: lidar
 scans, robot states, actions, rewards and the crowd behind them.
-Environment `{m.env}`, `{m.physics}` physics, seed {m.seed}.
+Environment `{m.env}`, `{m.physics}` physics, {_seed(m)}.
 {len(m.shards):,} HDF5 shards, {m.bytes:,} bytes ({m.bytes / max(m.rows, 1):,.0f} per step).
 
-Made by navrep-data, an independent re-implementation of the simulator of NavRep (Dugas et al. 2020);
+{_maps_note(m)}Made by navrep-data, an independent re-implementation of the simulator of NavRep (Dugas et al. 2020);
 it is not made or endorsed by the NavRep authors. If you use it, please cite their paper:
 
 ```bibtex
@@ -211,7 +261,7 @@ it is not made or endorsed by the NavRep authors. If you use it, please cite the
 ```
 
 Versions: {versions or "(not recorded)"}. Policy: `{json.dumps(m.policy, ensure_ascii=False)}`.
-{m.sensor.n_rays} rays from {m.sensor.angle_min:g} rad, {m.sensor.angle_increment:.6g} rad apart,
+{_sources(m)}{m.sensor.n_rays} rays from {m.sensor.angle_min:g} rad, {m.sensor.angle_increment:.6g} rad apart,
 anticlockwise; up to {m.sensor.range_max:g} m; one step is {m.sensor.dt:g} s.
 
 ## Columns

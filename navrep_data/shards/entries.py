@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from navrep_data.shards.source import SequenceSource
 
 SPLITS = ("train", "val", "test")
 SPLIT_RULE = "sequence % 10 == 1: val; sequence % 10 == 2: test; all others: train"
@@ -59,6 +62,8 @@ class ShardEntry:
         See :mod:`navrep_data.shards.statistics`.
     sequence_hashes : tuple of str
         Content hash per sequence.
+    source : tuple of SequenceSource
+        Where each sequence came from, in datasets made out of others; empty elsewhere.
     """
 
     file: str
@@ -69,6 +74,7 @@ class ShardEntry:
     worlds: FileEntry | None
     statistics: dict[str, Any] = field(repr=False)
     sequence_hashes: tuple[str, ...] = field(repr=False)
+    source: tuple[SequenceSource, ...] = field(default=(), repr=False)
 
 
 def split_of(sequence: int) -> str:
@@ -76,7 +82,7 @@ def split_of(sequence: int) -> str:
     return {1: "val", 2: "test"}.get(sequence % 10, "train")
 
 
-def _ranges(sequences: Iterable[int]) -> Ranges:
+def ranges_of(sequences: Iterable[int]) -> Ranges:
     """Return ascending indices as [start, stop) ranges."""
     result: list[tuple[int, int]] = []
     for k in sequences:
@@ -105,4 +111,4 @@ def default_splits(n: int) -> dict[str, Ranges]:
     Three sequences already have all three splits, and extending a dataset never moves a sequence to another
     one.
     """
-    return {name: _ranges(k for k in range(n) if split_of(k) == name) for name in SPLITS}
+    return {name: ranges_of(k for k in range(n) if split_of(k) == name) for name in SPLITS}

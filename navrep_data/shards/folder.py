@@ -274,7 +274,8 @@ def info(root: Path | str) -> dict[str, Any]:
     dict
         JSON values: env, physics, seed, sequences, rows, shards, bytes, bytes_per_row, columns, splits
         (sequences per split), outcomes, versions, complete, content_hash, license, partial (what the whole has, where
-        this is a part), origin (Hub repository and commit) and others.
+        this is a part), source (the datasets it was made out of), origin (Hub repository and commit) and
+        others.
     """
     m = Manifest.read(root)
     return {
@@ -300,5 +301,6 @@ def info(root: Path | str) -> dict[str, Any]:
         "license": m.license,
         "content_hash": content_hash(m),
         "partial": m.partial,
+        "source": list(m.source) or None,
         "origin": origin.to_dict() if (origin := read_origin(root)) else None,
     }

@@ -20,6 +20,7 @@ from navrep_data.schema import FORMAT_NAME, FORMAT_VERSION, SensorContract
 from navrep_data.shards._fields import SHA256, Fields, is_range
 from navrep_data.shards._layout import SCAN_DTYPES, column_order
 from navrep_data.shards.entries import SPLIT_RULE, SPLITS, FileEntry, Ranges, ShardEntry, default_splits
+from navrep_data.shards.source import parse_datasets, parse_sources
 from navrep_data.shards.statistics import check_statistics, merge_statistics
 
 MANIFEST_FILE = "manifest.json"
@@ -74,7 +75,9 @@ class Manifest:
     extras : tuple of FileEntry
         What a published dataset has besides: pictures for its card, an index of its episodes.
     partial : dict or None
-        In a copy that holds some shards only: what the whole has, see :data:`PARTIAL_FIELDS`.
+        In a copy that holds some shards only: what the whole has: hash of its manifest, shards, sequences, rows.
+    source : tuple of dict
+        Records of the datasets that this one was made out of, if it was: see ``navrep_data/shards/source.py``.
     format_version : int
         Version of the format.
     """
@@ -102,6 +105,7 @@ class Manifest:
     license: str | None = None
     extras: tuple[FileEntry, ...] = ()
     partial: dict[str, Any] | None = None
+    source: tuple[dict[str, Any], ...] = field(default=(), repr=False)
     format_version: int = FORMAT_VERSION
 
     @property
@@ -191,6 +195,8 @@ class Manifest:
             values["extras"] = [asdict(entry) for entry in self.extras]
         if self.partial is not None:
             values["partial"] = self.partial
+        if self.source:
+            values["source"] = list(self.source)
         values["card_sha256"] = self.card_sha256
         values["manifest_sha256"] = _hash(values)
         return values
@@ -298,6 +304,10 @@ def _entry_dict(shard: ShardEntry) -> dict[str, Any]:
     values = asdict(shard)
     values["sequences"] = list(shard.sequences)
     values["sequence_hashes"] = list(shard.sequence_hashes)
+    if shard.source:
+        values["source"] = [list(one) for one in shard.source]
+    else:
+        del values["source"]
     return values
 
 
@@ -318,6 +328,7 @@ def _parse(fields: Fields, root: Path) -> Manifest:
     if max_humans >= 1 << 16 or (max_humans < 1 and "humans" in columns):
         fields.bad("max_humans", "1 to 65535")
     card = fields.values.get("card_sha256")
+    source = parse_datasets(fields)
     return Manifest(
         env=fields.get("env", str),
         physics=fields.get("physics", str),
@@ -332,7 +343,9 @@ def _parse(fields: Fields, root: Path) -> Manifest:
         config=fields.get("config", dict),
         policy=fields.get("policy", dict),
         versions=fields.get("versions", dict),
-        shards=tuple(_parse_shard(fields, k, root, columns) for k in range(len(fields.get("shards", list)))),
+        shards=tuple(
+            _parse_shard(fields, k, root, columns, len(source)) for k in range(len(fields.get("shards", list)))
+        ),
         splits=_parse_splits(fields),
         split_rule=fields.get("split_rule", str),
         complete=fields.get("complete", bool),
@@ -340,6 +353,7 @@ def _parse(fields: Fields, root: Path) -> Manifest:
         command=fields.get("command", str),
         card_sha256=None if card is None else fields.sha256("card_sha256"),
         **_parse_publication(fields, root),
+        source=source,
         format_version=fields.count("format_version"),
     )
 
@@ -394,7 +408,7 @@ def _parse_splits(fields: Fields) -> dict[str, Ranges]:
     return {str(name): tuple((r[0], r[1]) for r in ranges) for name, ranges in values.items()}
 
 
-def _parse_shard(parent: Fields, index: int, root: Path, columns: Sequence[str]) -> ShardEntry:
+def _parse_shard(parent: Fields, index: int, root: Path, columns: Sequence[str], datasets: int) -> ShardEntry:
     prefix = f"shards[{index}]."
     fields = Fields(parent.values["shards"][index], parent.path, prefix)
     file = fields.file(root)
@@ -412,6 +426,7 @@ def _parse_shard(parent: Fields, index: int, root: Path, columns: Sequence[str])
         worlds=None if worlds is None else Fields(worlds, parent.path, prefix + "worlds.").file(root),
         statistics=_parse_statistics(fields, columns),
         sequence_hashes=hashes,
+        source=parse_sources(fields, datasets, stop - first),
     )
 
 

@@ -248,7 +248,7 @@ def merge_statistics(parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     Parameters
     ----------
     parts : iterable of dict
-        What :meth:`ShardStatistics.to_dict` returned, in shard order.
+        The statistics of each shard, as its manifest entry has them, in shard order.
 
     Returns
     -------

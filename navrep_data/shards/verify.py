@@ -120,7 +120,7 @@ def verify(root: Path | str, *, progress: Callable[[int, int], None] | None = No
     report.problems += _check_unlisted(root, manifest)
     report.problems += _check_origin(root, manifest)
     for extra in manifest.extras:
-        report.problems += [Problem(extra.file, bad)] if (bad := _check_file(root, extra)) else []
+        report.problems += [Problem(extra.file, bad)] if (bad := check_file(root, extra)) else []
         report.files += 1
         report.bytes += extra.bytes
     total = len(manifest.shards)
@@ -187,8 +187,16 @@ def _check_unlisted(root: Path, manifest: Manifest) -> Iterator[Problem]:
                 yield Problem(name, "is not in the manifest; remove it, or run the generate command again")
 
 
-def _check_file(root: Path, entry: FileEntry | ShardEntry) -> str:
-    """Return what is wrong with a listed file's bytes, or an empty string."""
+def check_file(root: Path, entry: FileEntry | ShardEntry) -> str:
+    """Return what is wrong with a listed file's bytes, or an empty string.
+
+    Parameters
+    ----------
+    root : pathlib.Path
+        Dataset folder.
+    entry : FileEntry or ShardEntry
+        As the manifest lists it.
+    """
     path = safe_join(root, entry.file)
     if path.is_symlink() or not path.is_file():
         return f"is missing; {_AGAIN}" if not path.is_symlink() else "is a link, expected a file"
@@ -201,7 +209,7 @@ def _check_file(root: Path, entry: FileEntry | ShardEntry) -> str:
 
 
 def _check_shard(root: Path, manifest: Manifest, entry: ShardEntry) -> Iterator[Problem]:
-    bad = _check_file(root, entry)
+    bad = check_file(root, entry)
     if bad:
         yield Problem(entry.file, bad)
         return
@@ -293,7 +301,7 @@ def _check_humans(humans: npt.NDArray[Any], is_first: npt.NDArray[np.bool_]) -> 
 
 
 def _check_worlds(root: Path, entry: FileEntry, starts: npt.NDArray[Any] | None) -> Iterator[Problem]:
-    bad = _check_file(root, entry)
+    bad = check_file(root, entry)
     if not bad and entry.bytes > MAX_WORLDS_BYTES:
         bad = f"has {entry.bytes:,} bytes, expected at most {MAX_WORLDS_BYTES:,}"
     if bad:

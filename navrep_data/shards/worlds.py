@@ -231,6 +231,31 @@ def concatenate_worlds(parts: Sequence[Arrays]) -> Arrays:
     return result
 
 
+def take_episodes(arrays: Mapping[str, npt.NDArray[Any]], first: int, stop: int) -> Arrays:
+    """Return the worlds of consecutive episodes alone, offsets starting at 0 again; the opposite of joining.
+
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+        Of a worlds file.
+    first, stop : int
+        Episodes [first, stop) of the file.
+    """
+    polygon = slice(*arrays["episode_polygon_offset"][[first, stop]])
+    parts = {
+        "episode": slice(first, stop),
+        "episode+1": slice(first, stop + 1),
+        "polygon+1": slice(polygon.start, polygon.stop + 1),
+        "vertex": slice(*arrays["polygon_offset"][[polygon.start, polygon.stop]]),
+        "human": slice(*arrays["human_offset"][[first, stop]]),
+    }
+    result: Arrays = {}
+    for name, (_, _, axis) in _fields_of(arrays).items():
+        taken = arrays[name][parts[axis]]
+        result[name] = taken - taken[0] if axis.endswith("+1") else taken.copy()
+    return result
+
+
 def _zip_bytes(members: Mapping[str, bytes]) -> bytes:
     """Return a zip archive of `members`, deflated, with the zip epoch as date."""
     body, directory = [], []

@@ -90,7 +90,7 @@ def sequence_hash(columns: Columns) -> str:
     Parameters
     ----------
     columns : mapping of str to ndarray
-        All columns in the schema's order; floats with one kind of NaN (:func:`canonical`).
+        All columns in the schema's order; floats with one kind of NaN.
 
     Notes
     -----

@@ -277,9 +277,11 @@ def check_way(
     """
     clearance = float(grid.signed_distance()[tuple(grid.cell_of(start))]) if grid.contains(start) else -np.inf
     if clearance < RADIUS:
+        where = f"{clearance:.2f} m from the nearest wall" if clearance > 0.0 else "inside a wall or on unknown ground"
         raise MapError(
-            f"Scenario {which!r}: the start ({start[0]:g}, {start[1]:g}) on map '{grid.name}' is {clearance:.2f} m "
-            f"from the nearest wall (negative: inside), expected at least {RADIUS} m: move it."
+            f"Scenario {which!r}: the start ({start[0]:g}, {start[1]:g}) is "
+            f"{'outside' if np.isinf(clearance) else where + ' on'} map '{grid.name}', expected at least {RADIUS} m of "
+            "free ground around it: move it."
         )
     plan = planning_map(grid)
     index = fields.index(grid, goal)

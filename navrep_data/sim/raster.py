@@ -31,6 +31,8 @@ _RAY_LINES = 36
 _LEG_LIMIT = 0.1
 _LEAST_HALF = 3.0
 _MAP_MARGIN = 2.0
+# [m]: the maps of Mark and CrowdMove, and asl, but not the larger buildings, where nobody could be seen
+_WHOLE_MAP = 26.0
 _MIN_SIZE, _MAX_SIZE = 16, 4096
 _STAR = np.array([[np.sin(k * np.pi / 5), np.cos(k * np.pi / 5)] for k in range(10)]) * np.where(
     np.arange(10) % 2, 0.4, 1.0
@@ -57,13 +59,16 @@ class Camera:
     def around(cls, state: WorldState, grid: GridMap | None = None) -> Camera:
         """Return the camera that shows a world's obstacles, border, robots, humans and goals.
 
-        On a map: its part around them, with some metres to all sides.
+        On a map: all of a small one, of others the part around them, with some metres to all sides.
         """
         points = [state.robots[:, 0:2], state.robots[:, 3:5], state.humans[:, 0:2], state.humans[:, 5:7]]
         everything = np.concatenate([*points, *(state.polygons if grid is None else [])])
         low, high = everything.min(axis=0), everything.max(axis=0)
         if grid is not None:
             low, high = low - _MAP_MARGIN, high + _MAP_MARGIN
+            left, right, bottom, top = grid.extent
+            if max(right - left, top - bottom) <= _WHOLE_MAP:
+                low, high = np.array([left, bottom]), np.array([right, top])
         x, y = (low + high) / 2
         return cls(float(x), float(y), max(_LEAST_HALF, float((high - low).max()) / 2 + _MARGIN))
 

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
 
 _Rule = tuple[tuple[str, ...], Callable[["SimConfig"], bool], str]
 
+# the 27 scenarios would fill a screen
+_MOST_NAMES = 3
+
 REFUSALS: tuple[_Rule, ...] = (
     (
         ("world", "obstacles"),
@@ -114,4 +117,8 @@ def check_combinations(config: SimConfig) -> None:
 
 
 def _shown(value: object) -> str:
-    return repr(list(value)) if isinstance(value, tuple) else repr(value)
+    if not isinstance(value, tuple):
+        return repr(value)
+    if len(value) <= _MOST_NAMES:
+        return repr(list(value))
+    return f"[{', '.join(map(repr, value[:_MOST_NAMES]))}, ... {len(value)} in all]"

@@ -180,8 +180,9 @@ class CallableRollout:
     config, settings, seed
         As for :class:`ScriptedRollout`.
     policy : callable
-        ``policy(scan, robot_state) -> action``, see :data:`PolicyFunction`. If it has a method ``reset``, that is
-        called as ``reset(batch_size=B)`` at the start of a group and ``reset(mask=...)`` where new episodes begin.
+        ``policy(scan, robot_state) -> action``: (B, 1080) [m] and (B, 5) in, (B, 2) or (B, 3) [m/s, m/s, rad/s] out. If
+        it has a method ``reset``, that is called as ``reset(batch_size=B)`` at the start of a group and
+        ``reset(mask=...)`` where new episodes begin.
     batch : int
         Sequences per group. The policy always sees exactly this many rows (the last group is filled up with copies of
         its first world), so that a network's numbers never depend on how many sequences there are.

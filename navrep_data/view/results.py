@@ -260,6 +260,7 @@ def _build(
     if maps.arrays:
         meta["maps"] = {"blob": len(blobs), "arrays": maps.arrays, "size": maps.size}
         blobs.append(maps.base64())
+        meta["facts"].append(["maps", "asl-pepper-2d-sim, which states no licence"])
     return assemble("results", meta, blobs)
 
 

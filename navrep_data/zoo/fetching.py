@@ -208,7 +208,7 @@ def fetch(name: str, source: str | os.PathLike[str] | None = None, *, progress: 
     UnknownNameError
         If there is no such name.
     CorruptDataError, OfflineError, DownloadError
-        As :func:`get_file`.
+        If a file is not what it must be, or cannot be had.
     """
     where = Source.of(source)
     return [path for r in with_parts(resolve(name)) for path in get_files(r, where, progress=progress).values()]

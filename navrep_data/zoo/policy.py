@@ -48,7 +48,8 @@ class Policy:
     name : str
         Full name, kept with results.
     context : str, optional
-        What the memory keeps, see :meth:`WorldModel.stream`; as the released model of that kind if left out.
+        What the memory keeps, see :meth:`navrep_data.models.WorldModel.stream`; as the released model of that kind if
+        left out.
     inference : str
         ``"deterministic"``: no dropout, z = mu, LSTM state zero at the start. ``"as_released"``: the memory runs as in
         the original, where dropout stayed on, z was sampled and the joint LSTM started anew from a random state at

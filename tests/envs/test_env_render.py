@@ -79,6 +79,24 @@ def test_the_camera_shows_all_and_stays_for_an_episode():
     assert env._camera is None
 
 
+@pytest.mark.parametrize(("side", "whole"), [(12.0, True), (40.0, False)])
+def test_small_maps_are_shown_whole_and_large_ones_in_part(tmp_path, side, whole):
+    Image.new("L", (60, 60), 254).save(tmp_path / "m.png")
+    (tmp_path / "m.yaml").write_text(
+        f"image: m.png\nresolution: {side / 60}\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\n"
+        "free_thresh: 0.196\n"
+    )
+    env = NavRepEnv("map", maps=(str(tmp_path),), humans=2)
+    places = [env.reset(seed=k)[1]["robot"][:2] for k in range(20)]
+    assert np.ptp(places, axis=0).min() > 0.4 * side
+    env.frame(32)
+    camera, state = env._camera, env._worlds.sim.state()
+    assert ((camera.x, camera.y) == (side / 2, side / 2)) == whole
+    assert (camera.half >= side / 2) == whole
+    everybody = np.concatenate([state.robot[None, :2], state.robot[None, 3:5], state.humans[:, :2]])
+    assert (np.abs(everybody - [camera.x, camera.y]) <= camera.half).all()
+
+
 def test_map_cells_are_painted_where_they_are():
     canvas = raster.Canvas(raster.Camera(0.0, 0.0, 4.0), 160)
     occupied = np.zeros((4, 3), bool)

@@ -207,7 +207,7 @@ def test_variants_with_several_runs_get_a_line_of_their_own(tmp_path):
         ({"policies": ["goal"], "episodes": 0}, ConfigError, "episodes is 0"),
         ({"policies": ["goal"], "workers": 0}, ConfigError, "workers is 0"),
         ({"policies": ["goal"], "inference": "noisy"}, ConfigError, "expected one of: deterministic, as_released"),
-        ({"policies": ["nowhere:function"]}, PolicyError, "cannot be imported"),
+        ({"policies": ["nowhere:function"]}, PolicyError, "cannot be imported.*or one of: goal, random, orca, dwa"),
         ({"policies": ["pilots_for_tests:wrong_shape"], "episodes": 1}, PolicyError, r"returned shape \(3, 2\)"),
         ({"policies": ["pilots_for_tests:not_a_number"], "episodes": 1}, PolicyError, "returned NaN"),
     ],

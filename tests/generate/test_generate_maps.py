@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from PIL import Image
 
+from navrep_data.errors import MissingExtraError
 from navrep_data.generate import generate, regenerate
 from navrep_data.shards import Manifest, read_worlds, verify
-from navrep_data.sim import load_map
+from navrep_data.sim import environment_names, load_map, make_config, map_names
 
 
 @pytest.fixture
@@ -56,3 +58,24 @@ def test_dataset_on_an_own_map(hall: str, tmp_path: Path, policy: object) -> Non
     if not callable(policy):
         report = regenerate(root, 2)
         assert [found.verdict for found in report.comparisons] == ["equal bytes"] * 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("physics", ["consistent", "original"])
+@pytest.mark.parametrize("env", environment_names())
+def test_every_environment_feeds_generate(env: str, physics: str, tmp_path: Path) -> None:
+    on_map = make_config(env).world == "map"
+    if on_map:
+        try:
+            map_names()
+        except MissingExtraError as error:
+            pytest.skip(str(error))
+    generate(env=env, physics=physics, n=1, length=60, out=tmp_path / "d", seed=1)
+    assert verify(tmp_path / "d").problems == []
+    manifest = Manifest.read(tmp_path / "d")
+    assert (manifest.env, manifest.physics, manifest.rows) == (env, physics, 60)
+    assert ("which states no licence" in (tmp_path / "d" / "README.md").read_text()) == on_map
+    # the scripted robot goes somewhere
+    with h5py.File(tmp_path / "d" / manifest.shards[0].file) as shard:
+        pose = shard["robot_pose"][:]
+    assert np.ptp(pose[:, :2], axis=0).max() > 0.5

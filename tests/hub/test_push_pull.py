@@ -18,10 +18,12 @@ from shards.synthetic import make_dataset
 from navrep_data.datasets import _hub_client, pull, push
 from navrep_data.datasets import hub as module
 from navrep_data.datasets.hub import parse_shards
+from navrep_data.datasets.tools import _pieces, filter, merge
 from navrep_data.errors import (
     ConfigError,
     CorruptDataError,
     DatasetError,
+    DatasetMismatchError,
     DatasetNotFoundError,
     DiskSpaceError,
     FolderInUseError,
@@ -69,6 +71,23 @@ def check_whole(root, template):
 
 
 # ---- without failures ----
+
+
+def test_what_tools_made_goes_up_and_comes_down_in_parts(hub, template, tmp_path, monkeypatch):
+    monkeypatch.setattr(_pieces, "TARGET_SHARD_ROWS", 80)
+    filter(template, tmp_path / "made", outcomes=["goal", "timeout", "stuck", "cut"])
+    made = Manifest.read(tmp_path / "made")
+    assert len(made.shards) > 1
+    push(tmp_path / "made", REPO, license="mit")
+    got = pull(REPO, tmp_path / "got", shards=[1])
+    assert not got.complete
+    assert verify(got.root).problems == []
+    part = Manifest.read(got.root)
+    assert part.source == made.source
+    assert part.shards[0].source == made.shards[1].source != ()
+    # rows are the same ones, by way of the Hub or not
+    with pytest.raises(DatasetMismatchError, match="is both in"):
+        merge([got.root, template], tmp_path / "twice")
 
 
 def test_there_and_back(hub, template, tmp_path):

@@ -241,6 +241,42 @@ def test_info_and_card(dataset):
     assert "not made or endorsed by the NavRep authors" in " ".join(card.split())
 
 
+@pytest.mark.parametrize(
+    ("config", "named"),
+    [
+        ({}, False),
+        ({"world": "map", "maps": ["/home/me/office"]}, False),
+        ({"world": "map", "maps": ["/home/me/office", "asl"]}, True),
+        ({"world": "map", "scenarios": ["rlasl1"]}, True),
+        ({"maps": 3, "human_policy": []}, False),
+    ],
+)
+def test_card_says_that_the_papers_maps_state_no_licence(dataset, config, named):
+    card = dataset_card(replace(Manifest.read(dataset), config=config, license="mit"))
+    assert ("`asl-pepper-2d-sim`, which states no licence" in card) == named
+
+
+def test_card_names_every_one_of_the_papers_maps(dataset):
+    from navrep_data.errors import MissingExtraError
+    from navrep_data.sim import map_names
+
+    try:
+        names = map_names()
+    except MissingExtraError as error:
+        pytest.skip(str(error))
+    manifest = Manifest.read(dataset)
+    for name in names:
+        assert "states no licence" in dataset_card(replace(manifest, config={"maps": [name]})), name
+
+
+def test_card_says_who_walked_and_how_the_lidar_saw(dataset):
+    manifest = Manifest.read(dataset)
+    plain = dataset_card(replace(manifest, config={}))
+    assert "a planar lidar without noise, humans that follow ORCA." in plain
+    other = dataset_card(replace(manifest, config={"human_policy": "static", "scan_noise": 0.1}))
+    assert "a planar lidar with noise, humans that stand still." in other
+
+
 def test_card_of_a_dataset_without_optional_parts(tmp_path):
     columns = tuple(c for c in ALL_COLUMNS if c not in ("rings", "humans"))
     manifest = make_dataset(tmp_path, 1, 1, 40, worlds=False, scan_dtype="float32", columns=columns)

@@ -112,6 +112,13 @@ def test_refused_combinations_name_their_fields(rule, example):
     assert hits[0] == names
 
 
+def test_refusals_do_not_list_all_scenarios():
+    with pytest.raises(
+        ConfigError, match=r"^scenarios=\['irosasl1', 'irosasl2', 'irosasl3', ... 27 in all\], robots=2 "
+    ):
+        make_config("ian", robots=2)
+
+
 def _unchecked(**fields):
     config = object.__new__(SimConfig)
     for f in dataclasses.fields(SimConfig):

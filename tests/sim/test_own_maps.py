@@ -10,8 +10,17 @@ from PIL import Image
 
 from navrep_data.errors import MapError, SimulationError
 from navrep_data.schema import Event
-from navrep_data.sim import RolloutSettings, ScriptedMapRollout, ScriptedPolicy, Simulator, load_map, make_config
-from navrep_data.sim.map_tables import _Fields, _Flat, check_way, spawn_places
+from navrep_data.sim import (
+    RolloutSettings,
+    Scenario,
+    ScriptedMapRollout,
+    ScriptedPolicy,
+    Simulator,
+    load_map,
+    make_config,
+    scenarios,
+)
+from navrep_data.sim.map_tables import spawn_places
 
 FREE, SOLID = 254, 0
 
@@ -119,16 +128,46 @@ def test_a_map_too_small_for_a_goal_is_refused(tmp_path: Path) -> None:
         Simulator(make_config("map", maps=(write_map(tmp_path / "small", grey),), humans=0))
 
 
-def test_starts_in_walls_and_goals_out_of_reach_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("who", "place", "words"),
+    [
+        (
+            0,
+            (7.05, 1.0),
+            r"Scenario 's': the start \(7.05, 1\) is inside a wall or on unknown ground on map 'hall', expected",
+        ),
+        (
+            1,
+            (-0.75, 1.0),
+            r"\(-0.75, 1\) is 0.20 m from the nearest wall on map 'hall', expected at least 0.3 m of free",
+        ),
+        (1, (40.0, 1.0), r"the start \(40, 1\) is outside map 'hall', expected at least"),
+        (2, (12.0, 1.0), r"the goal \(12, 1\) on map 'hall' is out of reach from \(2, 1\)"),
+        (3, (12.0, 1.0), r"the goal \(12, 1\) on map 'hall' is out of reach from \(4, 3\)"),
+        (2, (2.0, 40.0), r"Goal \(2, 40\) is not on map 'hall'"),
+        (None, (), ""),
+    ],
+)
+def test_starts_in_walls_and_goals_out_of_reach_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, who: int | None, place: tuple[float, ...], words: str
+) -> None:
+    """A scenario of robot and human, one of their starts (0, 1) or goals (2, 3) put elsewhere; the door is shut."""
     grey = hall()
     grey[:, 80:82] = SOLID
-    grid = load_map(write_map(tmp_path / "closed", grey))
-    fields = _Fields(_Flat(np.float32))
-    with pytest.raises(MapError, match=r"Scenario 's': the goal \(12, 1\) on map 'hall' is out of reach from \(2, 1\)"):
-        check_way(grid, np.array([2.0, 1.0]), np.array([12.0, 1.0]), fields, "s")
-    with pytest.raises(MapError, match=r"the start \(7.05, 1\) on map 'hall' is -?0.00 m from the nearest wall"):
-        check_way(grid, np.array([7.05, 1.0]), np.array([2.0, 1.0]), fields, "s")
-    check_way(grid, np.array([2.0, 1.0]), np.array([5.0, 3.0]), fields, "s")
+    path = write_map(tmp_path / "closed", grey)
+    points = np.array([(2.0, 1.0), (4.0, 3.0), (5.0, 3.0), (3.0, 0.0)])
+    if who is not None:
+        points[who] = place
+    scenario = Scenario("s", path, np.column_stack([points[:2], np.zeros(2)]), points[2:], np.ones(2))
+    known = {**scenarios._scenarios(), "s": scenario}
+    monkeypatch.setattr(scenarios, "_scenarios", lambda: known)
+    config = make_config("ian", scenarios=("s",))
+    if who is None:
+        assert Simulator(config).state().robot[:2] == pytest.approx([2.0, 1.0])
+        return
+    with pytest.raises(MapError, match=words) as caught:
+        Simulator(config)
+    assert "\n" not in str(caught.value)
 
 
 def test_spawn_places_keep_their_distance(path: str) -> None:

@@ -54,6 +54,8 @@ def test_scenes_share_maps_and_lie_the_right_way_up(results):
     assert scenes[0]["goal"] == [[3.0, 2.0]]
     picture = page.arrays(page.meta["maps"])["map_0"]
     np.testing.assert_array_equal(picture, [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]])
+    assert ["maps", "asl-pepper-2d-sim, which states no licence"] in page.meta["facts"]
+    assert "maps" not in dict(Reader(results_page(results).html).meta["facts"])
 
 
 def test_large_maps_become_coarser_without_losing_walls():
