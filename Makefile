@@ -7,7 +7,7 @@ DEMO ?= data/demo
 # test processes; 0 = all tests in one
 JOBS ?= auto
 
-.PHONY: help install demo test check format bench bench-peers test-nojit test-boundscheck coverage kill-test docs wheel clean
+.PHONY: help install demo test check format bench bench-peers test-nojit test-boundscheck coverage kill-test fuzz docs wheel clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 20
@@ -52,6 +52,12 @@ coverage: $(STAMP)  ## Line coverage of sim and observations, measured on plain 
 
 kill-test: $(STAMP)  ## 200 random SIGKILLs of generate (CI runs 10).
 	NAVREP_DATA_KILLS=200 $(BIN)/python -m pytest -m slow tests/generate/test_kill.py -s
+
+# seconds in all; FUZZ_ARGS="--only shard map" for some readers, --seed N to see a finding again
+SECONDS ?= 600
+
+fuzz: $(STAMP)  ## Fuzz every reader of files from outside for SECONDS=600 (CI: 60).
+	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(FUZZ_ARGS)
 
 BENCHMARKS := run zoo envs scale
 

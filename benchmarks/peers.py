@@ -195,6 +195,8 @@ def main() -> None:
         print(f"measuring {title} ...", file=sys.stderr, flush=True)
         found[title] = compare_loaders(Path(folder), sequences, repeats, seconds)
     text = tables(found, where)
+    if options.quick:
+        text += "\n\nMeasured with --quick: short turns, a small dataset."
     if options.json:
         print(json.dumps({"benchmark": "peers", "quick": options.quick, "machine": where, "results": found}))
     else:

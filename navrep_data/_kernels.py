@@ -34,6 +34,11 @@ def _cache_folder() -> str:
     return str(base / f"navrep-data-{digest.hexdigest()[:16]}")
 
 
+def kernel_cache_folder() -> Path:
+    """Return the folder that compiled kernels are kept in (not created)."""
+    return Path(_cache_folder())
+
+
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile `function` on first use, with numpy's error model, and keep it in a cache folder of its own.
 

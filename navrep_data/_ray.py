@@ -87,7 +87,12 @@ class RayCluster(Generic[Task, Result]):
         options: dict[str, Any] = {}
         _check_reachable(where)
         if where == LOCAL:
-            options = {"num_cpus": self.workers, "object_store_memory": LOCAL_STORE_BYTES, "include_dashboard": False}
+            options = {
+                "num_cpus": self.workers,
+                "object_store_memory": LOCAL_STORE_BYTES,
+                "include_dashboard": False,
+                "_node_ip_address": "127.0.0.1",  # nobody else has any business there
+            }
         try:
             self._ray.init(address=where, log_to_driver=False, logging_level="error", **options)
         except (ConnectionError, TimeoutError, ValueError, RuntimeError) as error:

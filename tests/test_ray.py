@@ -26,7 +26,7 @@ from navrep_data.generate import generate
 from navrep_data.shards import verify
 
 TESTS = Path(__file__).parent
-STORE_BYTES = 100 << 20
+HERE = {"node_ip_address": "127.0.0.1", "object_store_memory": 100 << 20}
 # dead nodes are noticed in a second or two instead of half a minute
 NOTICE = {
     "health_check_initial_delay_ms": 0,
@@ -57,7 +57,7 @@ class Nodes:
     def __init__(self):
         from ray.cluster_utils import Cluster
 
-        head = {"num_cpus": 0, "object_store_memory": STORE_BYTES, "include_dashboard": False, "_system_config": NOTICE}
+        head = {"num_cpus": 0, "include_dashboard": False, "_system_config": NOTICE, **HERE}
         self.cluster = Cluster(initialize_head=True, head_node_args=head)
         self.nodes, self.dead = [], []
         self.address = self.cluster.address
@@ -71,7 +71,7 @@ class Nodes:
         while self.dead:  # the helper counts them among its nodes until it is told
             self.cluster.remove_node(self.dead.pop(), allow_graceful=False)
         while len(self.nodes) < count:
-            self.nodes.append(self.cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES))
+            self.nodes.append(self.cluster.add_node(num_cpus=1, **HERE))
         self.cluster.wait_for_nodes(timeout=60)
 
     @staticmethod

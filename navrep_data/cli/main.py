@@ -11,6 +11,7 @@ import typer
 from navrep_data._version import __version__
 from navrep_data.cli import (
     benchmark,
+    doctor,
     encode,
     evaluate,
     generate,
@@ -41,6 +42,7 @@ app.command("merge-manifest")(merge_manifest.merge_manifest_command)
 app.command("benchmark")(benchmark.benchmark_command)
 app.command("info")(info.info_command)
 app.command("verify")(verify.verify_command)
+app.command("doctor")(doctor.doctor_command)
 app.command("import-npz")(import_npz.import_npz_command)
 app.command("import-rosbag")(tools.import_rosbag_command)
 app.command("merge")(tools.merge_command)

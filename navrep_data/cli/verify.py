@@ -18,7 +18,7 @@ def verify_command(
     seed: Annotated[int | None, typer.Option("--seed", help="Which sequences.", show_default="random")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Check every file of a dataset: hashes, schema, index, ranges, rings. Exits 1 if anything is wrong."""
+    """Check every file of a dataset: hashes, schema, index, ranges, rings. Exits 2 if anything is wrong."""
     from navrep_data.shards import verify
 
     with progress_bar("shard") as show:
@@ -39,4 +39,4 @@ def verify_command(
             detail = f" ({c.values:,} values differ, by at most {c.largest:.3g})" if c.values else ""
             say(f"sequence {c.sequence} made again: {c.verdict}{detail}")
     if not report.ok or (again is not None and not again.ok):
-        raise typer.Exit(1)
+        raise typer.Exit(2)

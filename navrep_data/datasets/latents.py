@@ -138,12 +138,15 @@ class LatentManifest:
                 f"{FORMAT_VERSION}. Upgrade it: pip install -U navrep-data"
             )
         hashed = {name: value for name, value in found.items() if name != "manifest_sha256"}
-        if found.get("manifest_sha256") != sha256_bytes(json_bytes(hashed)):
-            raise CorruptDataError(f"{path} does not match its own hash: it was changed or damaged; encode again.")
         try:
+            if found.get("manifest_sha256") != sha256_bytes(json_bytes(hashed)):
+                raise CorruptDataError(f"{path} does not match its own hash: it was changed or damaged; encode again.")
             return cls._parse(found, Path(root))
-        except (KeyError, TypeError, ValueError) as error:
-            raise CorruptDataError(f"{path} lacks or garbles a field ({error!r}); encode again.") from error
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
+            if isinstance(error, CorruptDataError):
+                raise
+            said = " ".join(repr(error).split())[:160]
+            raise CorruptDataError(f"{path} lacks or garbles a field ({said}); encode again.") from error
 
     @classmethod
     def _parse(cls, found: dict[str, Any], root: Path) -> LatentManifest:
@@ -205,8 +208,9 @@ def read_latent_shard(root: Path, shard: LatentShard, z_size: int) -> dict[str, 
         with h5py.File(io.BytesIO(data), "r") as file:
             for name, (dtype, width) in _COLUMNS.items():
                 columns[name] = _column(file, name, dtype, width if width >= 0 else z_size, shard.rows)
-    except (OSError, KeyError, RuntimeError, ValueError) as error:
-        raise CorruptDataError(f"{path} is not a shard of codes ({str(error)[:80]}); encode again.") from error
+    except Exception as error:  # a damaged file makes the HDF5 library raise nearly anything
+        said = " ".join(str(error).split())[:80]
+        raise CorruptDataError(f"{path} is not a shard of codes ({said}); encode again.") from error
     return columns
 
 
@@ -219,6 +223,9 @@ def _column(file: Any, name: str, dtype: str, width: int, rows: int) -> Array:
         raise ValueError(f"column {name} is not {wanted} {dtype}")
     if data.is_virtual or data.external:
         raise ValueError(f"column {name} points outside the file")
+    if data.chunks is not None or data.id.get_storage_size() != data.nbytes:
+        # as written: one piece, unpacked, so that no column is larger than its file
+        raise ValueError(f"column {name} is not stored in one piece")
     return np.asarray(data[()])
 
 

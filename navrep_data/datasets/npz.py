@@ -6,7 +6,6 @@ import math
 import os
 import platform
 import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from navrep_data.errors import (
     DatasetNotFoundError,
 )
 from navrep_data.io import new_folder, sha256_file
+from navrep_data.io.npz import PLAIN_METHODS
 from navrep_data.observations import scan_to_rings
 from navrep_data.schema import (
     ACTION_SIZE,
@@ -40,6 +40,8 @@ Arrays = dict[str, npt.NDArray[Any]]
 FILE_SUFFIX = "scans_robotstates_actions_rewards_dones.npz"
 # 100 times the original's sequences; its scans take 432 MB in memory.
 MAX_ROWS = 100_000
+MAX_FILE_BYTES = 1 << 30
+"""Largest file that is opened: :data:`MAX_ROWS` rows as float64 take half of it."""
 # Headers of the five arrays have 128 bytes each.
 MAX_HEADER = 4096
 MAX_SEQUENCES_PER_SHARD = 100
@@ -72,6 +74,8 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path, read: bool) -> tuple
             f"{path} has no array {name!r} (it has: {', '.join(archive.namelist()[:8])}); "
             f"expected {', '.join(_EXPECTED)}."
         ) from None
+    if info.compress_type not in PLAIN_METHODS:
+        raise CorruptDataError(f"{path}: array {name!r} is packed by method {info.compress_type}, expected deflate.")
     with archive.open(info) as handle:
         version = np.lib.format.read_magic(handle)
         if version != (1, 0):
@@ -104,18 +108,18 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path, read: bool) -> tuple
 
 def _load(path: Path, read: bool = True) -> tuple[int, Arrays]:
     """Return the number of rows of one file, and its arrays if `read`."""
+    size = path.stat().st_size
+    if size > MAX_FILE_BYTES:
+        raise DatasetError(f"{path} has {size:,} bytes, expected at most {MAX_FILE_BYTES:,} per file.")
     try:
         with zipfile.ZipFile(path) as archive:
             found = {name: _array(archive, name, path, read) for name in _EXPECTED}
     except DatasetError:
         raise
-    except (zipfile.BadZipFile, ValueError, EOFError, NotImplementedError, zlib.error) as error:
+    except Exception as error:  # damaged archives raise a dozen kinds, struct.error and zlib.error among them
+        said = " ".join(str(error).split())[:160]
         raise CorruptDataError(
-            f"{path} cannot be read as npz ({error}). Expected a file of the original software; get it again."
-        ) from error
-    except RuntimeError as error:  # what zipfile raises for an encrypted member
-        raise CorruptDataError(
-            f"{path} cannot be read as npz ({error}). Expected a file of the original software."
+            f"{path} cannot be read as npz ({said}). Expected a file of the original software; get it again."
         ) from error
     rows = {count for count, _ in found.values()}
     if len(rows) != 1:

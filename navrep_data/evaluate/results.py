@@ -149,9 +149,10 @@ class Results:
                 raise ValueError(f"format {value['format']!r} version {value['version']!r}")
             results = cls({key: value[key] for key in ("name", "sees", "variant", "settings", "versions")})
             results._read(value)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            said = " ".join(str(error).split())[:120]
             raise CorruptDataError(
-                f"{path} is not a results file of this version ({type(error).__name__}: {error}). Expected one written "
+                f"{path} is not a results file of this version ({type(error).__name__}: {said}). Expected one written "
                 "by navrep-data benchmark; run it again with another --out."
             ) from error
         return results
@@ -166,6 +167,8 @@ class Results:
         lengths = {len(self.events), len(self.steps), *map(len, self.metrics.values())}
         if lengths != {n}:
             raise ValueError("columns of different lengths")
+        if not all(isinstance(value["settings"][key], str) for key in ("suite", "physics", "inference")):
+            raise TypeError("settings that are no text")
         self.trajectories = {
             int(k): np.asarray(xy, np.float64).reshape(-1, 2) / 100.0 for k, xy in value["trajectories_cm"].items()
         }

@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import secrets
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,6 +20,10 @@ PART_SUFFIX = ".part"
 HASH_BLOCK = 1 << 20
 # A manifest of 35,000 shards of 20 sequences is about this large; generate refuses to make a larger one.
 MAX_JSON_BYTES = 256 << 20
+# A list or object takes 60 bytes or more, as text two: files of this package have 20 characters for each.
+_FREE_CONTAINERS, _BYTES_PER_CONTAINER = 1 << 16, 8
+# Half a pair of surrogates is no character: it can be neither printed nor written.
+_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 # What the operating system says when there is no room: disk full, quota used up, file size limit.
 _NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _NOT_ALLOWED = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
@@ -130,14 +135,22 @@ def read_json(path: Path | str, max_bytes: int = MAX_JSON_BYTES) -> Any:
     DatasetError
         If the file is too large.
     CorruptDataError
-        If it is not valid JSON, NaN and infinite numbers included.
+        If it is not valid JSON in UTF-8 (NaN, infinite numbers and half characters are not), or holds so many lists and
+        objects that they would take far more memory than the file has bytes.
     """
     path = Path(path)
     size = path.stat().st_size
     if size > max_bytes:
         raise DatasetError(f"{path} has {size:,} bytes, expected at most {max_bytes:,}: not a file of this package.")
     try:
-        return json.loads(path.read_bytes(), parse_float=_finite, parse_constant=_finite)
+        data = path.read_bytes()
+        containers = data.count(b"[") + data.count(b"{")
+        if containers > _FREE_CONTAINERS + len(data) // _BYTES_PER_CONTAINER:
+            raise ValueError(f"{containers:,} lists and objects in {len(data):,} bytes")
+        value = json.loads(data.decode(), parse_float=_finite, parse_constant=_finite)
+        if _SURROGATE.search(data):
+            json.dumps(value, ensure_ascii=False).encode()
+        return value
     except (ValueError, RecursionError) as error:
         raise CorruptDataError(
             f"{path} is not valid JSON ({error}). Expected a file written by navrep-data; get it again."

@@ -3,7 +3,7 @@
 
 A section of the scan becomes a 64-bit mask with one bit per range cell that some ray falls in. Everything
 behind the nearest return is at least unknown, so a cell's value is ``bit(mask) + bit(mask with all bits above
-its lowest set)``. Eight cells at a time are expanded from a byte of each mask by table.
+its lowest set)``. Eight cells at a time are expanded from a byte of each mask by table, and written as one word.
 
 Float scans go through the upper 16 bits of their float32 pattern: no two range edges share such a bucket, so
 one comparison with the bucket's edge decides the cell exactly.
@@ -29,18 +29,16 @@ def _write_section(mask, behind, spread, row):
     """Write one section: `mask` marks returns, `behind` marks every cell from the nearest return outwards."""
     for group in range(8):
         shift = np.uint64(8 * group)
-        low = np.int64((mask >> shift) & _BYTE)
-        high = np.int64((behind >> shift) & _BYTE)
-        for bit in range(8):
-            row[8 * group + bit] = spread[low, bit] + spread[high, bit]
+        # eight cells in one sum of words: none of them exceeds 2
+        row[group] = spread[np.int64((mask >> shift) & _BYTE)] + spread[np.int64((behind >> shift) & _BYTE)]
 
 
 @kernel
 def rings_from_mm(scan, cell_of_mm, first_ray, spread, out):
     """Rings of one scan in millimetres.
 
-    scan (n_rays,) uint16; cell_of_mm (65536,) uint8; first_ray (65,) int64; spread (256, 8) uint8;
-    out (64, 64) uint8, C-contiguous, overwritten.
+    scan (n_rays,) uint16; cell_of_mm (65536,) uint8; first_ray (65,) int64; spread (256,) uint64, eight cells each;
+    out (64, 8) uint64, eight cells each, overwritten.
     """
     for section in range(N_SECTIONS):
         mask = np.uint64(0)
@@ -89,14 +87,14 @@ def rings_from_metres(scan, bits, cell_of_bucket, edge_bits, first_ray, spread, 
 
 @kernel
 def rings_from_mm_rows(scans, cell_of_mm, first_ray, spread, out):
-    """`rings_from_mm` for scans (N, n_rays), out (N, 64, 64)."""
+    """`rings_from_mm` for scans (N, n_rays), out (N, 64, 8)."""
     for n in range(scans.shape[0]):
         rings_from_mm(scans[n], cell_of_mm, first_ray, spread, out[n])
 
 
 @kernel
 def rings_from_metres_rows(scans, bits, cell_of_bucket, edge_bits, first_ray, spread, out):
-    """`rings_from_metres` for scans (N, n_rays), out (N, 64, 64)."""
+    """`rings_from_metres` for scans (N, n_rays), out (N, 64, 8)."""
     for n in range(scans.shape[0]):
         rings_from_metres(scans[n], bits[n], cell_of_bucket, edge_bits, first_ray, spread, out[n])
 

@@ -23,6 +23,7 @@ from isal import isal_zlib
 
 from navrep_data.schema import RINGS_SHAPE
 from navrep_data.shards._rings_deflate import deflate_rings
+from navrep_data.shards._sums import byte_entropy
 
 DEFLATE_LEVEL = 1
 # Below this size a Huffman table per plane costs more than it saves.
@@ -76,10 +77,7 @@ def encode(block: npt.NDArray[Any]) -> bytes:
 
 def _is_noise(plane: npt.NDArray[np.uint8]) -> bool:
     """Return whether deflating `plane` would save little, judged by the entropy of a sample from its middle."""
-    sample = plane[plane.size * 7 // 16 : plane.size * 9 // 16]
-    share = np.bincount(sample, minlength=256) / sample.size
-    bits = -(share * np.log2(np.where(share > 0, share, 1.0))).sum()
-    return bool(bits > 8 * _NOISE_RATIO)
+    return bool(byte_entropy(plane[plane.size * 7 // 16 : plane.size * 9 // 16]) > 8 * _NOISE_RATIO)
 
 
 def _stored_blocks(plane: npt.NDArray[np.uint8]) -> list[bytes]:

@@ -1,5 +1,5 @@
 # mypy: allow-untyped-defs, allow-untyped-decorators, no-check-untyped-defs
-"""Sums over the two large columns of integers, in one pass and exact."""
+"""Sums over the two large columns of integers, in one pass and exact, and the entropy of bytes."""
 
 import numpy as np
 
@@ -37,3 +37,17 @@ def count_cells(cells):
         known += 1 if cells[k] != 0 else 0
         twos += 1 if cells[k] == 2 else 0
     return known, twos
+
+
+@kernel
+def byte_entropy(sample):
+    """Return the entropy of sample (n,) uint8, n > 0 [bit per byte]."""
+    counts = np.zeros(256, np.int64)
+    for k in range(sample.shape[0]):
+        counts[sample[k]] += 1
+    bits = 0.0
+    for value in range(256):
+        if counts[value] > 0:
+            share = counts[value] / sample.shape[0]
+            bits -= share * np.log2(share)
+    return bits

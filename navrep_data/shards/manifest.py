@@ -254,6 +254,7 @@ class Manifest:
             )
         try:
             manifest = _parse(fields, root)
+            digest = _hash(values)
         except RecursionError:
             raise CorruptDataError(f"{root / MANIFEST_FILE} is nested too deeply; get it again.") from None
         problem = _check_shards(manifest) or _check_splits(manifest)
@@ -262,7 +263,7 @@ class Manifest:
             fields.count("sequences"),
         ):
             problem = "fields 'rows' and 'sequences' are not the sums over shards"
-        if not problem and values.get("manifest_sha256") != _hash(values):
+        if not problem and values.get("manifest_sha256") != digest:
             problem = "field 'manifest_sha256' does not match the other fields"
         if problem:
             raise CorruptDataError(

@@ -2,12 +2,13 @@
 
 The HDF5 library opens a file once, to check its structure and to collect where its chunks lie. Rows are then
 read by ``os.pread`` and decoded by us: safe in threads and after a fork, no library lock, no handle to leak,
-and inflating is bounded by the chunk's size. Shards whose columns were filtered in another way (written by
-plain h5py) are read through h5py, slower.
+and inflating is bounded by the chunk's size. Columns without deflate (written by plain h5py) are read through h5py,
+slower. All rows and chunks must be in the file, none twice: what a column takes in memory is bounded by its file.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from pathlib import Path
@@ -23,9 +24,11 @@ from navrep_data.shards._codec import inflate, unshuffle
 from navrep_data.shards._layout import Layout, layouts
 from navrep_data.shards.entries import ShardEntry
 
-_DEFLATE, _SHUFFLE = 1, 2
+_DEFLATE, _SHUFFLE, _FLETCHER = 1, 2, 3
+_FLETCHER_BYTES = 4
 # Deflate, shuffle, fletcher32, and h5py's built-in lzf: what a plain h5py can read everywhere.
-_KNOWN_FILTERS = frozenset({_DEFLATE, _SHUFFLE, 3, 32000})
+_LZF = 32000
+_KNOWN_FILTERS = frozenset({_DEFLATE, _SHUFFLE, _FLETCHER, _LZF})
 _MAX_CHUNK_BYTES = 64 << 20
 # A narrow column is cached whole; no shard of ours comes near this.
 _MAX_NARROW_BYTES = 256 << 20
@@ -35,13 +38,31 @@ Array = npt.NDArray[Any]
 
 
 class _Chunked:
-    """Where the chunks of one column lie, if they are shuffled and deflated as we do it."""
+    """Where the chunks of one column lie, and which filters were left out of which of them.
 
-    def __init__(self, layout: Layout, chunk: int, shuffled: bool, offsets: Array, sizes: Array) -> None:
-        self.layout, self.chunk, self.shuffled = layout, chunk, shuffled
-        self.offsets, self.sizes = offsets, sizes
-        self.chunk_bytes = chunk * layout.row_bytes
+    Filters are those of our own writer and of h5py's gzip: deflate, perhaps after shuffle, perhaps before fletcher32.
+    """
+
+    def __init__(self, layout: Layout, shape: tuple[int, ...], grid: tuple[int, ...], codes: list[int]) -> None:
+        self.layout, self.shape, self.grid, self.codes = layout, shape, grid, codes
+        self.chunk = shape[0]
+        self.whole_rows = shape[1:] == layout.row_shape
+        self.chunk_bytes = math.prod(shape) * layout.dtype.itemsize
+        count = math.prod(grid)
+        self.offsets, self.sizes = np.full(count, -1, np.int64), np.zeros(count, np.int64)
+        self.masks = np.zeros(count, np.int64)
         self.row_items = layout.row_bytes // layout.dtype.itemsize
+
+    def note(self, info: Any) -> None:
+        """Take up what the HDF5 library says of one chunk."""
+        k = 0
+        for n, size, at in zip(self.grid, self.shape, info.chunk_offset, strict=True):
+            k = k * n + at // size
+        self.offsets[k], self.sizes[k], self.masks[k] = info.byte_offset, info.size, info.filter_mask
+
+    def applied(self, code: int, k: int) -> bool:
+        """Return whether chunk `k` went through a filter: HDF5 leaves optional ones out where they do not help."""
+        return code in self.codes and not int(self.masks[k]) >> self.codes.index(code) & 1
 
 
 class Shard:
@@ -224,11 +245,13 @@ class Shard:
         self.sequences = (int(first_stop[0]), int(first_stop[1]))
         numbers = {name: self._number(attributes, name) for name in SensorContract().to_dict()}
         self.sensor = SensorContract(n_rays=int(numbers.pop("n_rays")), **numbers)
+        if file.userblock_size:  # moves all offsets
+            raise self._corrupt(f"starts with a user block of {file.userblock_size} bytes; expected plain HDF5")
         datasets = {name: self._dataset(file, name) for name in file}
         self._check_layouts(datasets)
         size = os.path.getsize(self.path)
         for name, dataset in datasets.items():
-            chunked = None if file.userblock_size else self._chunk_table(dataset, self.columns[name], size)
+            chunked = self._chunk_table(dataset, self.columns[name], size)
             if chunked is not None:
                 self._chunked[name] = chunked
 
@@ -283,28 +306,30 @@ class Shard:
     def _chunk_table(self, dataset: Any, layout: Layout, file_size: int) -> _Chunked | None:
         """Return where the chunks are, or None if h5py has to read this column."""
         plist = dataset.id.get_create_plist()
-        codes = [plist.get_filter(k)[0] for k in range(plist.get_nfilters())]
-        if dataset.chunks is None or codes not in ([_DEFLATE], [_SHUFFLE, _DEFLATE]):
+        name, codes = layout.column.name, [plist.get_filter(k)[0] for k in range(plist.get_nfilters())]
+        if dataset.chunks is None:
+            # Rows that were never written take no bytes, but memory once they are read.
+            if dataset.id.get_storage_size() != dataset.nbytes or dataset.nbytes > file_size:
+                raise self._corrupt(f"lacks rows of column {name!r}: it is cut off or damaged")
             return None
-        chunk = int(dataset.chunks[0])
-        if dataset.chunks[1:] != layout.row_shape or chunk * layout.row_bytes > _MAX_CHUNK_BYTES:
+        shape = tuple(int(n) for n in dataset.chunks)
+        if math.prod(shape) * layout.dtype.itemsize > _MAX_CHUNK_BYTES:
+            raise self._corrupt(f"column {name!r} has chunks of more than {_MAX_CHUNK_BYTES:,} bytes")
+        grid = tuple(-(-n // size) for n, size in zip(dataset.shape, shape, strict=True))
+        if dataset.id.get_num_chunks() != math.prod(grid):
+            raise self._corrupt(f"lacks chunks of column {name!r}: it is cut off or damaged")
+        if _DEFLATE not in codes:
             return None
-        count = -(-self.rows // chunk)
-        offsets, sizes = np.full(count, -1, np.int64), np.zeros(count, np.int64)
-        masks = 0
-
-        def note(info: Any) -> None:
-            nonlocal masks
-            k = info.chunk_offset[0] // chunk
-            offsets[k], sizes[k] = info.byte_offset, info.size
-            masks |= info.filter_mask
-
-        dataset.id.chunk_iter(note)
-        if masks:
-            return None
-        if (offsets < 0).any() or (sizes < 0).any() or (offsets + sizes > file_size).any():
-            raise self._corrupt(f"lacks chunks of column {layout.column.name!r}: it is cut off or damaged")
-        return _Chunked(layout, chunk, codes[0] == _SHUFFLE, offsets, sizes)
+        if codes != [code for code in (_SHUFFLE, _DEFLATE, _FLETCHER) if code in codes]:
+            # the library would unpack whatever comes, however much that is
+            raise self._corrupt(f"column {name!r} uses HDF5 filters {codes}; expected shuffle and deflate")
+        chunked = _Chunked(layout, shape, grid, codes)
+        dataset.id.chunk_iter(chunked.note)
+        order = np.argsort(chunked.offsets)
+        starts, ends = chunked.offsets[order], (chunked.offsets + chunked.sizes)[order]
+        if (starts < 0).any() or (ends < starts).any() or (ends > file_size).any() or (ends[:-1] > starts[1:]).any():
+            raise self._corrupt(f"lacks chunks of column {name!r}, or they overlap: it is cut off or damaged")
+        return chunked
 
     # -- reading
 
@@ -329,21 +354,44 @@ class Shard:
         try:
             if len(data) != size:
                 raise ValueError("the file ends before it")
-            plain = inflate(data, chunked.chunk_bytes)
+            if chunked.applied(_FLETCHER, k):  # deflate has a checksum of its own, and files have their hash
+                data = data[:-_FLETCHER_BYTES]
+            plain = inflate(data, chunked.chunk_bytes) if chunked.applied(_DEFLATE, k) else data
+            if len(plain) != chunked.chunk_bytes:
+                raise ValueError(f"it has {len(plain)} bytes, expected {chunked.chunk_bytes}")
         except ValueError as error:
             raise self._corrupt(f"is damaged: chunk {k} of column {name!r}: {error}") from error
         self._last[name] = (k, plain)
         return plain
 
     def _rows(self, chunked: _Chunked, start: int, stop: int) -> Array:
+        if not chunked.whole_rows:
+            return self._grid_rows(chunked, start, stop)
         layout, step, items = chunked.layout, chunked.chunk, chunked.row_items
         parts = []
         for k in range(start // step, -(-stop // step)):
             first = k * step
             low, high = max(start - first, 0), min(stop - first, step)
-            parts.append(unshuffle(self._chunk(chunked, k), layout.dtype, items, low, high, chunked.shuffled))
+            parts.append(
+                unshuffle(self._chunk(chunked, k), layout.dtype, items, low, high, chunked.applied(_SHUFFLE, k))
+            )
         flat = parts[0] if len(parts) == 1 else np.concatenate(parts) if parts else np.empty(0, layout.dtype)
         return flat.reshape(stop - start, *layout.row_shape)
+
+    def _grid_rows(self, chunked: _Chunked, start: int, stop: int) -> Array:
+        """Return rows whose chunks do not hold them whole, as h5py cuts them by itself."""
+        layout, shape = chunked.layout, chunked.shape
+        low, high = start // shape[0], -(-stop // shape[0])
+        out = np.empty(
+            tuple(n * size for n, size in zip((high - low, *chunked.grid[1:]), shape, strict=True)), layout.dtype
+        )
+        for place in np.ndindex(high - low, *chunked.grid[1:]):
+            k = int(np.ravel_multi_index((place[0] + low, *place[1:]), chunked.grid))
+            plain = self._chunk(chunked, k)
+            values = unshuffle(plain, layout.dtype, 1, 0, math.prod(shape), chunked.applied(_SHUFFLE, k))
+            out[tuple(slice(p * n, (p + 1) * n) for p, n in zip(place, shape, strict=True))] = values.reshape(shape)
+        within = (slice(start - low * shape[0], stop - low * shape[0]), *(slice(n) for n in layout.row_shape))
+        return np.ascontiguousarray(out[within])
 
     def _whole(self, column: str, chunked: _Chunked | None) -> Array:
         """Return a narrow column, decoded once."""

@@ -25,6 +25,9 @@ from navrep_data.shards._sums import count_cells, sum_rays
 _BLOCK_ITEMS = 65536
 _MEANINGLESS_ON_LAST_ROW = ("action", "reward")
 
+_MOMENT_KEYS = ("count", "mean", "std", "min", "max")
+_OUTCOME_KEYS = ("episodes", "share", "steps", "mean_length", "min_length", "max_length")
+
 Floats = npt.NDArray[np.float64]
 
 
@@ -273,6 +276,21 @@ def scan_scale(dtype: np.dtype[Any]) -> float:
     return SCAN_SCALE if dtype.kind == "u" else 1.0
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_regular(values: Mapping[str, Any]) -> bool:
+    """Return whether these are the moments of one quantity or, in lists of one length, of several; None: of nothing."""
+    given = [values[key] for key in _MOMENT_KEYS]
+    if not all(isinstance(v, list) for v in given):
+        given = [[v] for v in given]
+    counts, others = given[0], given[1:]
+    return all(map(_is_number, counts)) and all(
+        len(v) == len(counts) and all(x is None or _is_number(x) for x in v) for v in others
+    )
+
+
 def check_statistics(values: Any, columns: Sequence[str]) -> str:
     """Return what is wrong with statistics from a manifest, or an empty string.
 
@@ -286,6 +304,10 @@ def check_statistics(values: Any, columns: Sequence[str]) -> str:
     try:
         if not isinstance(values, dict) or list(values["columns"]) != list(columns):
             return "does not cover the dataset's columns"
+        if not all(map(_is_regular, [*values["columns"].values(), values["humans_per_episode"]])):
+            return "holds something else than numbers, or lists of different lengths"
+        if not all(_is_number(outcome[key]) for outcome in values["outcomes"].values() for key in _OUTCOME_KEYS):
+            return "holds outcomes that are no numbers"
         merged = merge_statistics([values])
         if any(name not in EVENT_NAMES for name in values["outcomes"]) or not merged:
             return "names an unknown event"

@@ -25,6 +25,8 @@ from navrep_data.shards.worlds import MAX_WORLDS_BYTES, parse_worlds
 from navrep_data.shards.writer import canonical, check_finite, check_index, sequence_hash
 
 MAX_PROBLEMS_PER_FILE = 20
+MAX_SEQUENCE_BYTES = 4 << 30
+"""Memory that one sequence may take to be checked: 600,000 rows of a full dataset, a hundred times what is usual."""
 _AGAIN = "get it again, or run the generate command again"
 
 Columns = dict[str, npt.NDArray[Any]]
@@ -241,8 +243,12 @@ def _check_rows(
     starts = []
     checked = 0
     for k, (low, high) in enumerate(itertools.pairwise(bounds.tolist())):
-        columns = {name: canonical(shard.read(name, low, high)) for name in shard.columns}
         where = f"sequence {first + k}"
+        size = (high - low) * sum(layout.row_bytes for layout in shard.columns.values())
+        if size > MAX_SEQUENCE_BYTES:
+            yield Problem(entry.file, f"{where}: {high - low:,} rows take {size:,} bytes, too many to be checked")
+            return None
+        columns = {name: canonical(shard.read(name, low, high)) for name in shard.columns}
         problem = check_index(columns, first + k)
         if problem:
             yield Problem(entry.file, f"{where}: {problem}")

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from isal import isal_zlib
 
 from navrep_data.errors import CorruptDataError
+from navrep_data.io.npz import PLAIN_METHODS
 
 MAX_WORLDS_BYTES = 256 << 20
 _ADVICE = "get the file again, or run the generate command again"
@@ -319,6 +320,8 @@ def parse_worlds(data: bytes, where: str) -> Worlds:
             fields = _fields_of([name.removesuffix(".npy") for name in names])
             if sorted(names) != sorted(f"{name}.npy" for name in fields):
                 raise ValueError(f"its members are {names[:20]}")
+            if any(entry.compress_type not in PLAIN_METHODS for entry in archive.infolist()):
+                raise ValueError("it is packed in another way than stored or deflated")
             # zipfile stops at the size that the directory declares, so this bounds what is unpacked.
             if sum(entry.file_size for entry in archive.infolist()) > MAX_WORLDS_BYTES:
                 raise ValueError(f"it unpacks to more than {MAX_WORLDS_BYTES:,} bytes")
@@ -327,7 +330,7 @@ def parse_worlds(data: bytes, where: str) -> Worlds:
         if problem:
             raise ValueError(problem)
     except Exception as error:  # damaged zips raise a dozen kinds, NotImplementedError and struct.error among them
-        reason = str(error).rstrip(".") or type(error).__name__
+        reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
         raise CorruptDataError(f"{where} is not a worlds file: {reason}; {_ADVICE}.") from error
     return Worlds(arrays)
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import math
-import zipfile
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from pathlib import Path
@@ -17,11 +15,11 @@ from numpy.typing import NDArray
 
 from navrep_data.errors import DiskSpaceError, FolderNotWritableError
 from navrep_data.io import atomic_write_bytes, cache_dir
+from navrep_data.io.npz import read_npz
 
 # Raised with any change of what the files mean; old ones are then left alone.
 FORMAT = 1
 _Scalar = TypeVar("_Scalar", bound=np.generic)
-_DAMAGED = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError)
 
 
 def content_hash(*parts: object) -> str:
@@ -77,9 +75,9 @@ def _read(path: Path, shape: tuple[int, ...], dtype: type[_Scalar]) -> NDArray[_
     try:
         if path.stat().st_size > np.dtype(dtype).itemsize * math.prod(shape) + 4096:
             return None
-        with open(path, "rb") as handle, np.load(handle, allow_pickle=False) as data:
-            array: NDArray[_Scalar] = data["values"]
-    except _DAMAGED:
+        with open(path, "rb") as handle:
+            array: NDArray[_Scalar] = read_npz(handle, np.dtype(dtype).itemsize * math.prod(shape) + 4096)["values"]
+    except (OSError, ValueError, KeyError):
         return None
     return array if array.shape == shape and array.dtype == dtype else None
 

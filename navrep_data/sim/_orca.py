@@ -37,10 +37,15 @@ from navrep_data.sim._orca_neighbors import (
     OA_X,
     OA_Y,
     ORCA_AGENT_FIELDS,
+    WORK_COVERED,
     WORK_EDGE,
     WORK_LINE,
     WORK_NEIGHBOR,
     WORK_PROJ,
+    WORK_X1,
+    WORK_X2,
+    WORK_Y1,
+    WORK_Y2,
     agent_neighbors,
     make_orca_work,
     obstacle_neighbors,
@@ -74,22 +79,28 @@ OP_DT = 4
 ORCA_PARAM_FIELDS = 5
 
 
-@njit(cache=True, error_model="numpy")
-def _covered(x1, y1, x2, y2, scaled_radius, n_lines, lines):
-    """Return whether some line already keeps the agent off both (scaled) ends of an edge."""
-    for k in range(n_lines):
-        lx = lines[4 * k]
-        ly = lines[4 * k + 1]
-        dx = lines[4 * k + 2]
-        dy = lines[4 * k + 3]
-        if (x1 - lx) * dy - (y1 - ly) * dx - scaled_radius >= -RVO_EPSILON and (x2 - lx) * dy - (
-            y2 - ly
-        ) * dx - scaled_radius >= -RVO_EPSILON:
-            return True
-    return False
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _edge_ends(px, py, inv_tau, n, edges, obst_f, x1, y1, x2, y2, covered):
+    """Write the (scaled) ends of `n` edges as seen from the agent, and that no line covers them yet."""
+    for k in range(n):
+        j = edges[k]
+        x1[k] = inv_tau * (obst_f[OF_X, j] - px)
+        y1[k] = inv_tau * (obst_f[OF_Y, j] - py)
+        x2[k] = inv_tau * (obst_f[OF_X2, j] - px)
+        y2[k] = inv_tau * (obst_f[OF_Y2, j] - py)
+        covered[k] = 0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _cover(lx, ly, dx, dy, scaled_radius, n, x1, y1, x2, y2, covered):
+    """Mark those of `n` edges both (scaled) ends of which a line keeps the agent off."""
+    for k in range(whole_blocks(n)):
+        first = (x1[k] - lx) * dy - (y1[k] - ly) * dx - scaled_radius >= -RVO_EPSILON
+        second = (x2[k] - lx) * dy - (y2[k] - ly) * dx - scaled_radius >= -RVO_EPSILON
+        covered[k] |= np.int32(1) if first & second else np.int32(0)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _tangent(x, y, dist_sq, radius, radius_sq, sign):
     """Direction of the tangent from the origin to a circle at (x, y); `sign` +1 = left, -1 = right."""
     leg = np.sqrt(dist_sq - radius_sq)
@@ -98,7 +109,7 @@ def _tangent(x, y, dist_sq, radius, radius_sq, sign):
     return (x * leg - y * r) * scale, (x * r + y * leg) * scale
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _put_line(x, y, dx, dy, n_lines, lines):
     lines[4 * n_lines] = x
     lines[4 * n_lines + 1] = y
@@ -107,9 +118,9 @@ def _put_line(x, y, dx, dy, n_lines, lines):
     return n_lines + 1
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _edge_line(j, px, py, vx, vy, radius, inv_tau, n, obst_f, obst_i, lines):
-    """Add the constraint of edge `j` to the `n` lines, if it makes one; return the number of lines."""
+    """Add the constraint of edge `j`, which none covers, to the `n` lines, if it makes one; return their number."""
     o1 = j
     o2 = obst_i[OI_NEXT, j]
     r1x = obst_f[OF_X, o1] - px
@@ -121,9 +132,6 @@ def _edge_line(j, px, py, vx, vy, radius, inv_tau, n, obst_f, obst_i, lines):
     right_x = inv_tau * r2x
     right_y = inv_tau * r2y
     scaled_radius = inv_tau * radius
-    if _covered(left_x, left_y, right_x, right_y, scaled_radius, n, lines):
-        return n
-
     radius_sq = radius * radius
     dist1 = r1x * r1x + r1y * r1y
     dist2 = r2x * r2x + r2y * r2y
@@ -251,7 +259,7 @@ def _edge_line(j, px, py, vx, vy, radius, inv_tau, n, obst_f, obst_i, lines):
     return _put_line(right_x + scaled_radius * rl_y, right_y - scaled_radius * rl_x, -rl_x, -rl_y, n, lines)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _agent_lines(px, py, vx, vy, radius, inv_tau, inv_dt, count, neighbors, lines):
     """Write the constraints of `count` neighbours to `lines`.
 
@@ -294,7 +302,7 @@ def _agent_lines(px, py, vx, vy, radius, inv_tau, inv_dt, count, neighbors, line
         lines[4 * k + 3] = -ux if circle else ly
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def orca_velocity(
     i, agents, lo, hi, extra, pref_vx, pref_vy, obst_f, obst_i, n_obst, params, work_f, work_i
 ):  # fmt: skip
@@ -336,10 +344,17 @@ def orca_velocity(
     n_edges = obstacle_neighbors(px, py, reach * reach, obst_f, obst_i, n_obst, work_f, work_i)
     lines = work_f[WORK_LINE]
     n_obstacle = 0
+    edges, covered = work_i[WORK_EDGE], work_i[WORK_COVERED]
+    x1, y1, x2, y2 = work_f[WORK_X1], work_f[WORK_Y1], work_f[WORK_X2], work_f[WORK_Y2]
+    _edge_ends(px, py, inv_tau, n_edges, edges, obst_f, x1, y1, x2, y2, covered)
     for k in range(n_edges):
-        n_obstacle = _edge_line(
-            work_i[WORK_EDGE, k], px, py, vx, vy, radius, inv_tau, n_obstacle, obst_f, obst_i, lines
-        )  # fmt: skip
+        if covered[k] != 0:
+            continue
+        n = _edge_line(edges[k], px, py, vx, vy, radius, inv_tau, n_obstacle, obst_f, obst_i, lines)
+        if n > n_obstacle:
+            line = lines[4 * n_obstacle : 4 * n]
+            n_obstacle = n
+            _cover(line[0], line[1], line[2], line[3], inv_tau * radius, n_edges, x1, y1, x2, y2, covered)
 
     neighbor_dist = params[OP_NEIGHBOR_DIST]
     most = int(params[OP_MAX_NEIGHBORS])
@@ -356,7 +371,7 @@ def orca_velocity(
     return x, y
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def orca_step(agents, preferred, obst_f, obst_i, n_obst, params, work_f, work_i, out):
     """Write the new velocities of all agents, each of which sees all others, to `out` (N, 2) float32."""
     n = agents.shape[0]

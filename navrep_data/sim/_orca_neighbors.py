@@ -41,13 +41,15 @@ _NEAR = 1  # those of the candidates, compacted
 WORK_LINE = 2  # the constraints, LINE_FIELDS numbers each: x, y, dx, dy
 WORK_PROJ = 3  # the same for linear program 3
 WORK_NEIGHBOR = 4  # x, y, vx, vy, radius of every neighbour, NB_FIELDS numbers each
-WORK_F_ROWS = 5
+WORK_X1, WORK_Y1, WORK_X2, WORK_Y2 = 5, 6, 7, 8  # scaled ends of the obstacle neighbours, nearest first
+WORK_F_ROWS = 9
 NB_FIELDS = 5
 _CANDIDATE = 0  # index of every candidate
 _ORDER = 1  # positions among the candidates, nearest first
 _RANK = 2
 WORK_EDGE = 3  # the obstacle neighbours, nearest first
-WORK_I_ROWS = 4
+WORK_COVERED = 4  # whether some line makes an obstacle neighbour superfluous
+WORK_I_ROWS = 5
 
 INF = np.float32(np.inf)
 # An edge within this factor of the search range is counted only if RVO2's walk over the tree would reach it:
@@ -70,7 +72,7 @@ def make_orca_work(max_edges: int = 512, max_agents: int = 64) -> tuple[NDArray[
     return work_f, np.zeros((WORK_I_ROWS, columns), np.int32)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _edge_distances(px, py, obst_f, n, work_f):
     """Squared distance to every edge that has the agent on its right, infinite for the others."""
     x = obst_f[OF_X]
@@ -98,7 +100,7 @@ def _edge_distances(px, py, obst_f, n, work_f):
         out[j] = d if left < F0 else INF
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _compact(n, limit, work_f, work_i):
     """Collect the indices with distance below `limit`; return their number."""
     m = 0
@@ -110,7 +112,7 @@ def _compact(n, limit, work_f, work_i):
     return m
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _sort(m, work_f, work_i):
     """Order the candidates by distance, equal ones by position: ranks by counting, which has no branches."""
     near = work_f[_NEAR]
@@ -127,17 +129,17 @@ def _sort(m, work_f, work_i):
         work_i[_ORDER, rank[a]] = a
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _left_of_edge(px, py, j, obst_f):
     return (obst_f[OF_X, j] - px) * obst_f[OF_EY, j] - (obst_f[OF_Y, j] - py) * obst_f[OF_EX, j]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _near_side(px, py, j, obst_f):
     return LEFT if _left_of_edge(px, py, j, obst_f) >= F0 else RIGHT
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _comes_first(a, b, px, py, obst_f, obst_i):
     """Return whether RVO2's walk over the tree meets edge `a` before edge `b`."""
     if obst_i[OI_NEXT, a] == b or obst_i[OI_NEXT, b] == a:  # a shared corner: nearly every tie, prepared
@@ -157,7 +159,7 @@ def _comes_first(a, b, px, py, obst_f, obst_i):
     return side_a == near
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _reached(j, px, py, range_sq, obst_f, obst_i):
     """Return whether RVO2's walk over the tree gets as far as edge `j`."""
     node = j
@@ -173,7 +175,7 @@ def _reached(j, px, py, range_sq, obst_f, obst_i):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def obstacle_neighbors(px, py, range_sq, obst_f, obst_i, n, work_f, work_i):
     """List the edges within range, nearest first, ties in the order of RVO2's walk; return their number."""
     _edge_distances(px, py, obst_f, n, work_f)
@@ -204,7 +206,7 @@ def obstacle_neighbors(px, py, range_sq, obst_f, obst_i, n, work_f, work_i):
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def agent_neighbors(i, agents, lo, hi, extra, range_sq, most, work_f, work_i):
     """Copy the nearest agents to the neighbour rows, nearest first; return their number.
 

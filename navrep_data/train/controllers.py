@@ -17,7 +17,7 @@ from torch import nn
 
 from navrep_data._version import __version__
 from navrep_data.errors import CheckpointError, ConfigError, TrainingError
-from navrep_data.io import atomic_write_json, read_json
+from navrep_data.io import atomic_write_json
 from navrep_data.models import Controller, ControllerConfig, EndToEnd, EndToEndConfig, checkpoint
 from navrep_data.models.world_model import WorldModel
 from navrep_data.schema import ROBOT_STATE_SIZE, Event, SensorContract
@@ -247,7 +247,7 @@ class _Run(BaseCallback):
         self.policy_now = make_policy(recipe, network, model, model_name)
         self.at = state.Progress()
         folder = state.last_folder(out) if resume else None
-        done = int(read_json(folder / "training.json", _MAX_JSON)["step"]) if folder is not None else 0
+        done = state.read_step(folder) if folder is not None else 0
         # worlds of a resumed run come from a stream of their own
         stream = int(np.random.SeedSequence([recipe.seed, done]).generate_state(1, np.uint32)[0])
         self.worlds = TrainingWorlds(

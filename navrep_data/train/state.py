@@ -17,9 +17,10 @@ Nothing is pickled. All randomness of a step follows from seed and step, so no g
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -147,9 +148,10 @@ def last_folder(out: Path) -> Path | None:
     path = out / PROGRESS_FILE
     if not path.is_file():
         return None
-    name = str(read_json(path, _MAX_JSON).get("last", ""))
+    found = read_json(path, _MAX_JSON)
+    name = str(found.get("last", "")) if isinstance(found, dict) else ""
     folder = out / CHECKPOINTS / name
-    if "/" in name or not name.startswith("step-") or not (folder / _STATE).is_file():
+    if not re.fullmatch(r"step-\d{1,12}", name) or not (folder / _STATE).is_file():
         raise CheckpointError(f"{path} names {name[:60]!r}, which is not there: start anew in another folder.")
     return folder
 
@@ -169,12 +171,12 @@ def load(
     if type(saved) is not type(model) or getattr(saved, "config", 0) != getattr(model, "config", 1):
         raise CheckpointError(f"{folder} holds another network than this recipe trains: resume with its own recipe.")
     model.load_state_dict(saved.state_dict())
-    state = read_json(folder / _STATE, _MAX_JSON)
+    progress, digest = _read_state(folder)
     path = folder / _WEIGHTS
     if not path.is_file() or path.stat().st_size > _MAX_WEIGHTS:
         raise CheckpointError(f"{path} is missing or too large: start anew in another folder.")
     data = path.read_bytes()
-    if sha256_bytes(data) != state.get("sha256"):
+    if sha256_bytes(data) != digest:
         raise CheckpointError(f"{path} does not have the SHA-256 of {_STATE}: it was changed or cut short.")
     try:
         tensors = safetensors.torch.load(data)
@@ -183,14 +185,30 @@ def load(
     by_name = dict((trained or model).named_parameters())
     for key, tensor in tensors.items():
         if key.startswith("optimizer/"):
-            name, what = key.removeprefix("optimizer/").rsplit("/", 1)
-            if name not in by_name:
+            name, _, what = key.removeprefix("optimizer/").rpartition("/")
+            if name not in by_name or tensor.shape not in (by_name[name].shape, ()):
                 raise CheckpointError(f"{path} has a state of {name[:60]!r}, unknown in this network.")
             # torch keeps the step counter on the CPU
             optimizer.state[by_name[name]][what] = tensor if what == "step" else tensor.to(device)
     extra = {k.removeprefix("extra/"): t.to(device) for k, t in tensors.items() if k.startswith("extra/")}
-    best = state["best"]
-    return Progress(
-        int(state["step"]), int(state["tokens"]), float(state["seconds"]), None if best is None else float(best),
-        int(state["best_step"]), extra,
-    )  # fmt: skip
+    return replace(progress, extra=extra)
+
+
+def read_step(folder: Path) -> int:
+    """Return how many steps the checkpoint in `folder` had done."""
+    return _read_state(folder)[0].step
+
+
+def _read_state(folder: Path) -> tuple[Progress, str]:
+    """Return where a checkpoint stood, without its tensors, and their hash."""
+    state = read_json(folder / _STATE, _MAX_JSON)
+    try:
+        best = state["best"]
+        progress = Progress(
+            int(state["step"]), int(state["tokens"]), float(state["seconds"]), None if best is None else float(best),
+            int(state["best_step"]),
+        )  # fmt: skip
+        digest = str(state["sha256"])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise CheckpointError(f"{folder / _STATE} lacks or garbles a field: start anew in another folder.") from error
+    return progress, digest

@@ -191,7 +191,8 @@ def claim(
     if not path.is_file():
         raise ConfigError(f"There is no training to resume in {out}: expected {state.RECIPE_FILE}; leave out --resume.")
     before = read_json(path, _MAX_RECIPE)
-    old = before.get("settings", {}) if isinstance(before, dict) else {}
+    old = before.get("settings") if isinstance(before, dict) else None
+    old = old if isinstance(old, dict) else {}
     for name, value in settings.items():
         if name not in free and old.get(name) != value:
             raise ConfigError(

@@ -31,6 +31,14 @@ MAX_POINTS = 2000
 """Points of one trajectory that are shown."""
 MAX_MAP_CELLS = 1024
 """Cells of a map along its longer side; finer ones are made coarser, occupied where any cell was."""
+METRIC_UNITS = {
+    "time_to_goal": "s",
+    "path_length": "m",
+    "min_clearance": "m",
+    "personal_space_time": "s",
+    "mean_jerk": "m/s\u00b3",
+}
+"""Units of the benchmark's metrics, which its files do not say."""
 _FAR = 1e6  # centimetres: nothing of a benchmark is 10 km away
 F64 = NDArray[np.float64]
 
@@ -253,6 +261,7 @@ def _build(
         ],
         "notes": list(notes),
         "dt": DT,
+        "units": METRIC_UNITS,
         "scenarios": scenarios or [{"name": "all", "scene": None}],
         "policies": entries,
         "maps": None,

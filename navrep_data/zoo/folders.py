@@ -114,11 +114,25 @@ def read_policy(folder: Path | str) -> dict[str, Any]:
             f"{path} has format version {str(found.get('format_version'))[:20]}, expected {POLICY_VERSION}: install a "
             "newer navrep-data."
         )
+    check_described(found, path, {"parts": ([CONTROLLER], [CONTROLLER, "world_model"], [CONTROLLER, "vae"])})
+    if not isinstance(found.get("name"), str) or not isinstance(found.get("metadata"), dict):
+        raise CheckpointError(f"{path}: name or metadata are missing; get the policy again.")
+    return found
+
+
+def check_described(found: Mapping[str, Any], path: Path, more: Mapping[str, tuple[Any, ...]]) -> None:
+    """Refuse the description of a policy unless features, lidar, context, sensor and `more` are what they may be.
+
+    Raises
+    ------
+    CheckpointError
+        If one is not.
+    """
     allowed: dict[str, tuple[Any, ...]] = {
         "features": ("z", "h", "zh", None),
         "lidar": ("rings", "1d", None),
         "context": (*_CONTEXTS, None),
-        "parts": ([CONTROLLER], [CONTROLLER, "world_model"], [CONTROLLER, "vae"]),
+        **more,
     }
     for name, values in allowed.items():
         if found.get(name) not in values:
@@ -128,9 +142,6 @@ def read_policy(folder: Path | str) -> dict[str, Any]:
         sensor = {}
     if set(sensor) != set(SensorContract().to_dict()):
         raise CheckpointError(f"{path}: sensor is no sensor contract; get the policy again.")
-    if not isinstance(found.get("name"), str) or not isinstance(found.get("metadata"), dict):
-        raise CheckpointError(f"{path}: name or metadata are missing; get the policy again.")
-    return found
 
 
 def load_folder(

@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-from navrep_data.errors import CheckpointError, CorruptDataError
+from navrep_data.errors import CheckpointError
 from navrep_data.io import read_json
 from navrep_data.schema import SensorContract
+from navrep_data.zoo.folders import check_described
 
 POLICY_FILE = "policy.json"
 """Beside a controller's weights: what it sees through."""
@@ -76,21 +77,19 @@ def load_policy(folder: Path, **options: Any) -> Any:
     Raises
     ------
     CorruptDataError
-        If ``policy.json`` is not what training writes.
+        If ``policy.json`` is no JSON.
     CheckpointError
-        If a checkpoint is missing or does not fit.
+        If ``policy.json`` is not what training writes, or a checkpoint is missing or does not fit.
     """
     from navrep_data.models import VAE, ActorCritic, WorldModel, checkpoint
     from navrep_data.zoo.policy import Policy
 
     found = read_json(folder / POLICY_FILE, _MAX_JSON)
-    try:
-        features, lidar, context, part = (found[key] for key in ("features", "lidar", "context", "world_model"))
-        sensor = SensorContract(**found["sensor"])
-        if part not in (None, PARTS):
-            raise ValueError(f"world_model {str(part)[:40]!r}")
-    except (KeyError, TypeError, ValueError) as error:
-        raise CorruptDataError(f"{folder / POLICY_FILE} lacks or garbles a field ({error!r}); get it again.") from error
+    if not isinstance(found, dict):
+        raise CheckpointError(f"{folder / POLICY_FILE} is not the description of a policy; get it again.")
+    check_described(found, folder / POLICY_FILE, {"world_model": (None, PARTS)})
+    features, lidar, context, part = (found.get(key) for key in ("features", "lidar", "context", "world_model"))
+    sensor = SensorContract(**found["sensor"])
     network = checkpoint.load(folder)
     if not isinstance(network, ActorCritic):
         raise CheckpointError(f"{folder} holds a {type(network).__name__}, expected a controller.")

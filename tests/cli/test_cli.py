@@ -72,7 +72,7 @@ def test_verify_finds_a_flipped_byte(dataset, tmp_path):
     data[5000] ^= 8
     shard.write_bytes(data)
     done = run("verify", tmp_path / "d")
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert "data/shard-00000.h5" in done.stdout
     assert not json.loads(run("verify", tmp_path / "d", "--json").stdout)["ok"]
 

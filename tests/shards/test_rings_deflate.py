@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from navrep_data._kernels import kernel
 from navrep_data.observations import scan_to_rings
+from navrep_data.shards._bits import high_zeros, low_zeros
 from navrep_data.shards._codec import encode, inflate
 from navrep_data.shards._rings_deflate import deflate_rings
 
@@ -96,3 +98,17 @@ def test_every_copy_length():
         cells.append((cells[-64] + 1) % 3)
     cells += [0] * (-len(cells) % 4096)
     check(np.array(cells, np.uint8).reshape(-1, 64, 64))
+
+
+@pytest.mark.parametrize(
+    ("word", "low", "high"), [(0, 64, 64), (1, 0, 63), (1 << 63, 63, 0), (0x0000100000080000, 19, 19)]
+)
+def test_zero_bits_of_a_word(word, low, high):
+    """Compiled, and as plain Python (without numba these are the functions themselves)."""
+    assert (low_zeros(np.uint64(word)), high_zeros(np.uint64(word))) == (low, high)
+    assert _both(np.uint64(word)) == (low, high)
+
+
+@kernel
+def _both(word):
+    return low_zeros(word), high_zeros(word)

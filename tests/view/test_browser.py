@@ -254,7 +254,9 @@ def test_results_scenarios_trajectories_and_time(browser, results, tmp_path):
     assert tab.evaluate("document.querySelectorAll('#timeline button').length") == len(mine)
     tab.click("#timeline button:nth-child(3)")
     assert tab.evaluate("document.querySelector('#badge').textContent").startswith(f"episode {mine[2]}: ")
-    assert f"{columns['steps'][mine[2]]} steps" in tab.evaluate("document.querySelector('#state').textContent")
+    state = tab.evaluate("document.querySelector('#state').textContent")
+    assert f"{columns['steps'][mine[2]]} steps" in state
+    assert f"path length {columns['metrics']['path_length'][mine[2]]} m" in state
     tab.press("Escape")
     assert tab.evaluate("document.querySelector('#badge').hidden") is True
     tab.press("Home")

@@ -7,6 +7,7 @@ import pytest
 from view_pages import HOSTILE, Reader, write_results
 
 from navrep_data.errors import ConfigError, CorruptDataError, DatasetError, DatasetNotFoundError
+from navrep_data.evaluate.metrics import METRICS
 from navrep_data.view import Scene, is_results, results_page
 from navrep_data.view.results import coarser
 
@@ -65,6 +66,11 @@ def test_large_maps_become_coarser_without_losing_walls():
     assert coarse.shape == (834, 10)
     assert coarse.sum() == 1
     assert coarse[1234 // 3, 17 // 3]
+
+
+def test_metrics_have_their_units(results):
+    units = {metric.name: metric.unit.replace("^3", "\u00b3") for metric in METRICS if metric.unit}
+    assert Reader(results_page(results / "0.json").html).meta["units"] == units
 
 
 def test_the_size_is_bounded(tmp_path):

@@ -112,6 +112,11 @@ function showStep(step) {
   $('clock').textContent = `step ${step} of ${player.rows - 1} · ${(step * player.dt).toFixed(1)} s`;
 }
 
+function metricText([name, value]) {
+  const unit = Object.hasOwn(meta.units, name) ? ` ${meta.units[name]}` : '';
+  return `${name.replaceAll('_', ' ')} ${String(value).replace('-', '−')}${unit}`;
+}
+
 function showChosen() {
   const e = state.episodes.find((one) => one.number === state.chosen);
   $('badge').hidden = !e;
@@ -119,7 +124,7 @@ function showChosen() {
     $('badge').textContent = `episode ${e.number}: ${OUTCOME_TEXT[known(e.event)]}`;
     $('badge').style.borderColor = outcomeColour(e.event);
     const kept = e.points ? '' : ' · its trajectory was not kept';
-    $('state').textContent = [`seed ${e.seed}`, `${e.steps} steps`, ...e.metrics.map(([name, value]) => `${name.replaceAll('_', ' ')} ${value}`)].join(' · ') + kept;
+    $('state').textContent = [`seed ${e.seed}`, `${e.steps} steps`, ...e.metrics.map(metricText)].join(' · ') + kept;
   } else {
     const kept = state.episodes.filter((one) => one.points).length;
     $('state').textContent = `${state.episodes.length} episodes, ${kept} with a trajectory`;
