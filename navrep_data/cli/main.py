@@ -18,6 +18,7 @@ from navrep_data.cli import (
     hub,
     import_npz,
     info,
+    merge_manifest,
     models,
     play,
     reproduce,
@@ -38,6 +39,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("generate")(generate.generate_command)
+app.command("merge-manifest")(merge_manifest.merge_manifest_command)
 app.command("benchmark")(benchmark.benchmark_command)
 app.command("info")(info.info_command)
 app.command("verify")(verify.verify_command)
