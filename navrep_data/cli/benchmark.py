@@ -52,7 +52,7 @@ def benchmark_command(
     ] = None,
     figures: Annotated[bool, typer.Option("--figures/--no-figures", help="Draw.")] = True,
     executor: Annotated[
-        str, typer.Option("--executor", help="local (this machine) or ray (a cluster; needs navrep-data[ray]).")
+        str, typer.Option("--executor", help="local (this machine) or ray (a cluster; needs navrep-data\\[ray]).")
     ] = "local",
     address: Annotated[
         str | None,

@@ -85,7 +85,7 @@ def generate_command(
         bool, typer.Option("--humans-column/--no-humans-column", help="Store the humans behind each scan.")
     ] = True,
     executor: Annotated[
-        str, typer.Option("--executor", help="local (this machine) or ray (a cluster; needs navrep-data[ray]).")
+        str, typer.Option("--executor", help="local (this machine) or ray (a cluster; needs navrep-data\\[ray]).")
     ] = "local",
     address: Annotated[
         str | None,
