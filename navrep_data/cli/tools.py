@@ -193,7 +193,9 @@ def import_rosbag_command(
     length: Annotated[int, typer.Option("--length", help="Most rows of a sequence.")] = 1000,
     range_max: Annotated[float, typer.Option("--range-max", help="Largest range to store \\[m].")] = 25.0,
     mount: Annotated[str, typer.Option("--mount", help="Scanner on the robot: x,y,yaw \\[m, m, rad].")] = "0,0,0",
-    goal_radius: Annotated[float, typer.Option("--goal-radius", help="A goal is reached nearer than this \\[m].")] = 0.5,
+    goal_radius: Annotated[
+        float, typer.Option("--goal-radius", help="A goal is reached nearer than this \\[m].")
+    ] = 0.5,
     assume_same_frame: Annotated[
         bool, typer.Option("--assume-same-frame", help="Goals and odometry are in one frame, whatever it is called.")
     ] = False,
