@@ -26,8 +26,7 @@ from navrep_data.generate import generate
 from navrep_data.shards import verify
 
 TESTS = Path(__file__).parent
-# Ray's switch for the address of this machine, read when it is imported: 0 = the loopback, as on a laptop. Tests may use
-# no other.
+# Ray's switch for the address of this machine, read when it is imported: 0 = the loopback, and tests may use no other
 os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
 HERE = {"node_ip_address": "127.0.0.1", "object_store_memory": 100 << 20}
 # dead nodes are noticed in a second or two instead of half a minute
