@@ -59,7 +59,6 @@ def ray_node() -> Iterator[str]:
             "num_cpus": 2,
             "object_store_memory": STORE_BYTES,
             "include_dashboard": False,
-            "node_ip_address": "127.0.0.1",
         },
     )
     try:

@@ -26,6 +26,8 @@ from navrep_data.generate import generate
 from navrep_data.shards import verify
 
 TESTS = Path(__file__).parent
+# Ray's switch for the address of this machine, read when it is imported: 0 = the loopback, and tests may use no other
+os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
 HERE = {"node_ip_address": "127.0.0.1", "object_store_memory": 100 << 20}
 # dead nodes are noticed in a second or two instead of half a minute
 NOTICE = {
@@ -254,7 +256,7 @@ def die(_, __):
 def test_a_cluster_of_its_own_ends_with_the_run(tmp_path):
     """No address: Ray starts here and is gone afterwards; from the command line, as users do it."""
     words = "generate --n 3 --length 30 --humans 4 --obstacles 3 --shard-size 1 --executor ray --workers 1 --out d"
-    env = {k: v for k, v in os.environ.items() if k != "RAY_ADDRESS"} | {"RAY_TMPDIR": "/tmp"}
+    env = {k: v for k, v in os.environ.items() if k != "RAY_ADDRESS"}
     done = subprocess.run(
         [sys.executable, "-m", "navrep_data", *words.split()], cwd=tmp_path, env=env, capture_output=True, text=True,
         timeout=240,

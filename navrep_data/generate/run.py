@@ -192,7 +192,7 @@ class Run:
 
     def _clean_up(self) -> None:
         """Remove what killed processes left behind: temp files and shards that never left staging."""
-        self.store.clean_up(self.request.shards)
+        self.store.clean_up(None if self.request.part is None else self.request.shards)  # others are at work
         for path in self.home.glob(f".*{PART_SUFFIX}"):
             path.unlink(missing_ok=True)
 

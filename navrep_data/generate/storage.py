@@ -55,13 +55,13 @@ class FolderStore:
         """Move a file from staging to its place."""
         os.replace(self.root / STAGING / file, self.root / file)
 
-    def clean_up(self, shards: Container[int]) -> None:
-        """Remove temp files of these shards, and those that never left staging."""
+    def clean_up(self, shards: Container[int] | None) -> None:
+        """Remove temp files of these shards (None: of all), and what never left staging."""
         shutil.rmtree(self.root / STAGING, ignore_errors=True)
         for folder in (self.root / "data", self.root / "worlds"):
-            for path in folder.glob(f".shard-*{PART_SUFFIX}"):
+            for path in folder.glob(f".*{PART_SUFFIX}"):
                 number = path.name.removeprefix(".shard-").partition(".")[0]
-                if number.isdecimal() and int(number) in shards:
+                if shards is None or (number.isdecimal() and int(number) in shards):
                     path.unlink(missing_ok=True)
 
     def finish(self, root: Path) -> None:
@@ -126,7 +126,7 @@ class UrlStore:
         fs, base = self._place
         fs.mv(f"{base}/{STAGING}/{file}", f"{base}/{file}")
 
-    def clean_up(self, shards: Container[int]) -> None:
+    def clean_up(self, shards: Container[int] | None) -> None:
         """Remove shards that never left staging."""
         fs, base = self._place
         if fs.exists(f"{base}/{STAGING}"):
