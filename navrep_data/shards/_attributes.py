@@ -42,12 +42,13 @@ def read_attribute(file: h5py.File, name: str) -> Any:
         raise ValueError(f"attribute {name!r} is text of variable length, expected fixed length: HDF5 may hang on it")
     if not text and kind.get_class() not in _PLAIN:
         raise ValueError(f"attribute {name!r} is neither text nor a number")
-    if attribute.get_storage_size() > MAX_BYTES:
+    space = attribute.get_space()
+    if text and space.get_simple_extent_type() != h5py.h5s.SCALAR:
+        raise ValueError(f"attribute {name!r} is not one text")
+    if space.get_simple_extent_npoints() * kind.get_size() > MAX_BYTES:
         raise ValueError(f"attribute {name!r} has more than {MAX_BYTES:,} bytes")
     if not text:
         return file.attrs[name]
-    if attribute.get_space().get_simple_extent_type() != h5py.h5s.SCALAR:
-        raise ValueError(f"attribute {name!r} is not one text")
     try:
         return bytes(file.attrs[name]).decode()
     except UnicodeDecodeError as error:
