@@ -467,6 +467,23 @@ def test_codes_that_are_not_there(files):
     refused(lambda: target.read(files), CorruptDataError, "not stored in one piece")
 
 
+@pytest.mark.parametrize(
+    ("name", "file", "at", "size", "words"),
+    [("bag-ros1", "bag.bag", 13, 2**32 - 1, "Header could not be read"),
+     ("bag-mcap", "bag/bag.mcap", 9, 2**40, "Truncated record")],
+)  # fmt: skip
+def test_bags_that_claim_more_bytes_than_they_have(tmp_path, name, file, at, size, words):
+    """Found by fuzzing: the first record's length was set aside in memory before anything was read."""
+    pytest.importorskip("rosbags")
+    target = BY_NAME[name]
+    target.make(tmp_path)
+    data = bytearray((tmp_path / file).read_bytes())
+    width = 4 if name == "bag-ros1" else 8
+    data[at : at + width] = size.to_bytes(width, "little")
+    (tmp_path / file).write_bytes(data)
+    refused(lambda: target.read(tmp_path), CorruptDataError, words)
+
+
 def test_one_sequence_of_more_rows_than_fit_into_memory(tmp_path, monkeypatch):
     from navrep_data.shards import verify
     from navrep_data.testing import tiny_dataset
