@@ -141,11 +141,13 @@ def _fit_rows(shard: dict[str, Any], data: bytes, values: dict[str, Any]) -> Non
     """Let the manifest say of rows and lengths what the shard says."""
     import h5py
 
+    from navrep_data.shards._attributes import read_attribute
+
     with contextlib.suppress(Exception), h5py.File(io.BytesIO(data), "r") as file:
-        rows = int(file.attrs["rows"])
+        rows = int(read_attribute(file, "rows"))
         if rows != shard["rows"]:
             values["rows"] = shard["rows"] = rows
-            values["length"] = max(values["length"], int(file.attrs["length"]), rows)
+            values["length"] = max(values["length"], int(read_attribute(file, "length")), rows)
 
 
 def _read_shard(folder: Path) -> None:
