@@ -7,7 +7,7 @@ DEMO ?= data/demo
 # test processes; 0 = all tests in one
 JOBS ?= auto
 
-.PHONY: help install demo test check format bench bench-peers test-nojit test-boundscheck coverage kill-test fuzz docs wheel clean
+.PHONY: help install demo test check format bench bench-peers test-nojit test-boundscheck coverage kill-test fuzz cards docs wheel clean
 
 help:  ## List the targets.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 20
@@ -59,7 +59,7 @@ SECONDS ?= 600
 fuzz: $(STAMP)  ## Fuzz every reader of files from outside for SECONDS=600 (CI: 60).
 	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(FUZZ_ARGS)
 
-BENCHMARKS := run zoo envs
+BENCHMARKS := run zoo envs scale
 
 bench: $(STAMP)  ## Measure speed and size; writes benchmarks/RESULTS.md.
 	failed=0; for script in $(BENCHMARKS); do $(BIN)/python benchmarks/$$script.py --write || failed=1; done; exit $$failed
@@ -67,6 +67,11 @@ bench: $(STAMP)  ## Measure speed and size; writes benchmarks/RESULTS.md.
 bench-peers: $(STAMP)  ## Measure other simulators beside ours; writes benchmarks/RESULTS.md.
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev,peers]"
 	$(BIN)/python benchmarks/peers.py --write
+
+PUBLISHED ?= data/published
+
+cards: $(STAMP)  ## Generate the datasets that we publish; writes their cards and pictures into cards/datasets.
+	$(BIN)/python -m navrep_data.datasets.cards cards/datasets --data $(PUBLISHED)
 
 docs: $(STAMP)  ## Build the documentation site into site/; any warning is an error.
 	rm -rf site

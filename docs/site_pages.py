@@ -33,6 +33,7 @@ NAVIGATION = {
             "evaluate",
             "train",
             "view",
+            "doctor",
             "schema",
             "errors",
             "io",

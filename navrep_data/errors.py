@@ -94,6 +94,10 @@ class WorkerDiedError(NavrepDataError, RuntimeError):
     """A worker process ended without a result."""
 
 
+class ClusterError(NavrepDataError, ConnectionError):
+    """A cluster cannot be reached, or its nodes are not fit for the work."""
+
+
 class DownloadError(NavrepDataError, OSError):
     """A file could not be brought here from the network."""
 

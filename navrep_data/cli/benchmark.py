@@ -16,7 +16,7 @@ def benchmark_command(
         list[str] | None,
         typer.Argument(
             metavar="NAME...",
-            help="Baselines goal, random, orca, dwa; networks (navrep-data models); your own module:function.",
+            help="Baselines goal, random, orca, dwa; networks (navrep-data models); your ./folder or module:function.",
         ),
     ] = None,
     suite: Annotated[
@@ -31,7 +31,10 @@ def benchmark_command(
         int | None,
         typer.Option("--episodes", help="Episodes per scenario.", show_default="navreptest 200, navrep27 300"),
     ] = None,
-    workers: Annotated[int, typer.Option("--workers", help="Processes; numbers do not depend on it.")] = 1,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", help="Processes; numbers do not depend on it.", show_default="1; on Ray all"),
+    ] = None,
     inference: Annotated[
         str,
         typer.Option("--inference", help="deterministic, or as_released (memories with the noise of their training)."),
@@ -48,6 +51,13 @@ def benchmark_command(
         typer.Option("--redraw", metavar="PATH", help="Play nothing: tables and figures of DIR/SUITE-PHYSICS again."),
     ] = None,
     figures: Annotated[bool, typer.Option("--figures/--no-figures", help="Draw.")] = True,
+    executor: Annotated[
+        str, typer.Option("--executor", help="local (this machine) or ray (a cluster; needs navrep-data\\[ray]).")
+    ] = "local",
+    address: Annotated[
+        str | None,
+        typer.Option("--address", help="Ray cluster, HOST:PORT.", show_default="RAY_ADDRESS, or one of its own here"),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Score policies on numbered episodes that everybody plays alike.
@@ -69,7 +79,18 @@ def benchmark_command(
     else:
         with _Bars() as bars:
             report = evaluate.benchmark(
-                names, suite, physics, episodes, workers, inference, source, out, figures, progress=bars
+                names,
+                suite,
+                physics,
+                episodes,
+                workers,
+                inference,
+                source,
+                out,
+                figures,
+                executor=executor,
+                address=address,
+                progress=bars,
             )
     if as_json:
         print_json(report.to_dict())

@@ -29,7 +29,9 @@ def generate_command(
     n: Annotated[int, typer.Option("--n", help="Number of sequences of --length rows.")] = 100,
     out: Annotated[Path | None, typer.Option("--out", help="Dataset folder.", show_default="data/<env>")] = None,
     seed: Annotated[int, typer.Option("--seed", help="Same seed and settings, same bytes.")] = 0,
-    workers: Annotated[int | None, typer.Option("--workers", help="Processes.", show_default="number of cores")] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Processes, or tasks on Ray.", show_default="all cores")
+    ] = None,
     length: Annotated[int, typer.Option("--length", help="Rows per sequence (0.2 s each).")] = 1000,
     physics: Annotated[
         str | None,
@@ -82,6 +84,25 @@ def generate_command(
     humans_column: Annotated[
         bool, typer.Option("--humans-column/--no-humans-column", help="Store the humans behind each scan.")
     ] = True,
+    executor: Annotated[
+        str, typer.Option("--executor", help="local (this machine) or ray (a cluster; needs navrep-data\\[ray]).")
+    ] = "local",
+    address: Annotated[
+        str | None,
+        typer.Option("--address", help="Ray cluster, HOST:PORT.", show_default="RAY_ADDRESS, or one of its own here"),
+    ] = None,
+    storage: Annotated[
+        str | None,
+        typer.Option(
+            "--storage", metavar="URL", help="Write shards there (s3://..., by fsspec); --out keeps the rest."
+        ),
+    ] = None,
+    shard_range: Annotated[
+        str | None,
+        typer.Option(
+            "--shard-range", metavar="I/N", help="Make part I (from 0) of N only; then merge-manifest. For job arrays."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
 ) -> None:
     """Simulate robots among people and write a dataset of lidar sequences.
@@ -90,11 +111,14 @@ def generate_command(
     """  # fmt: skip
     from navrep_data.generate import generate
 
+    if workers is None and executor == "local":
+        workers = _cores()
     result = generate(
-        env=env, n=n, out=out, seed=seed, workers=_cores() if workers is None else workers, length=length,
+        env=env, n=n, out=out, seed=seed, workers=workers, length=length,
         physics=physics, humans=humans, obstacles=obstacles, legs=legs, maps=maps or None, policy=policy,
         policy_batch=policy_batch, shard_size=shard_size, scan_dtype=scan_dtype, rings=rings,
-        humans_column=humans_column, progress=show_progress(), report=say_err if as_json else say,
+        humans_column=humans_column, executor=executor, address=address, storage=storage, shard_range=shard_range,
+        progress=show_progress(), report=say_err if as_json else say,
     )  # fmt: skip
     if as_json:
         print_json(result.to_dict())
@@ -105,13 +129,17 @@ def generate_command(
 def _print_summary(result: GenerateResult) -> None:
     episodes = max(1, sum(result.outcomes.values()))
     outcomes = ", ".join(f"{name} {100 * count / episodes:.0f} %" for name, count in result.outcomes.items() if count)
+    part = "" if result.part is None else f", part {result.part}"
     say(
-        f"{result.root}: {result.sequences} sequences, {result.rows:,} rows, {result.shards} shards, "
-        f"{result.bytes / 1e6:,.1f} MB ({result.bytes / result.rows / 1e3:.2f} kB/row)"
+        f"{result.root}{part}: {result.sequences} sequences, {result.rows:,} rows, {result.shards} shards, "
+        f"{result.bytes / 1e6:,.1f} MB ({result.bytes / max(1, result.rows) / 1e3:.2f} kB/row)"
     )
     if result.new_rows:
         speed = f"made {result.new_rows:,} rows in {result.seconds:.1f} s: {result.rows_per_s:,.0f} rows/s"
         compiled = result.setup_seconds > COMPILED_SECONDS
         say(speed + (f" (after {result.setup_seconds:.0f} s of compiling kernels)" if compiled else ""))
     say(f"{episodes:,} episodes: {outcomes}")
-    say(f"next: navrep-data info {result.root}")
+    if result.part is None:
+        say(f"next: navrep-data info {result.root}")
+    else:
+        say(f"next, when all parts are made: navrep-data merge-manifest {result.root}")

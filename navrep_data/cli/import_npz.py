@@ -17,7 +17,7 @@ def import_npz_command(
     ],
     out: Annotated[Path, typer.Option("--out", help="Dataset folder, new or empty.")],
     env: Annotated[str, typer.Option("--env", help="Name to record as the environment.")] = "imported",
-    range_max: Annotated[float, typer.Option("--range-max", help="Largest range of the recorded sensor [m].")] = 25.0,
+    range_max: Annotated[float, typer.Option("--range-max", help="Largest range of the recorded sensor \\[m].")] = 25.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Convert sequences recorded by the original NavRep into a dataset."""

@@ -18,6 +18,7 @@ from navrep_data.cli import (
     hub,
     import_npz,
     info,
+    merge_manifest,
     models,
     play,
     reproduce,
@@ -37,29 +38,30 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("generate")(generate.generate_command)
-app.command("benchmark")(benchmark.benchmark_command)
-app.command("info")(info.info_command)
-app.command("verify")(verify.verify_command)
-app.command("doctor")(doctor.doctor_command)
-app.command("import-npz")(import_npz.import_npz_command)
-app.command("import-rosbag")(tools.import_rosbag_command)
-app.command("merge")(tools.merge_command)
-app.command("split")(tools.split_command)
-app.command("filter")(tools.filter_command)
-app.command("stats")(tools.stats_command)
-app.command("sample")(tools.sample_command)
-app.command("export")(tools.export_command)
-app.command("play")(play.play_command)
-app.command("push")(hub.push_command)
-app.command("pull")(hub.pull_command)
-app.command("push-model")(hub.push_model_command)
-app.command("view")(view.view_command)
-app.add_typer(models.models_app, name="models")
-app.command("encode")(encode.encode_command)
-app.add_typer(train.train_app, name="train")
-app.add_typer(evaluate.evaluate_app, name="evaluate")
-app.command("reproduce")(reproduce.reproduce_command)
+app.command("generate", rich_help_panel="Make and check data")(generate.generate_command)
+app.command("merge-manifest", rich_help_panel="Make and check data")(merge_manifest.merge_manifest_command)
+app.command("info", rich_help_panel="Make and check data")(info.info_command)
+app.command("verify", rich_help_panel="Make and check data")(verify.verify_command)
+app.command("doctor", rich_help_panel="Make and check data")(doctor.doctor_command)
+app.command("view", rich_help_panel="Make and check data")(view.view_command)
+app.command("merge", rich_help_panel="Change and convert data")(tools.merge_command)
+app.command("split", rich_help_panel="Change and convert data")(tools.split_command)
+app.command("filter", rich_help_panel="Change and convert data")(tools.filter_command)
+app.command("stats", rich_help_panel="Change and convert data")(tools.stats_command)
+app.command("sample", rich_help_panel="Change and convert data")(tools.sample_command)
+app.command("export", rich_help_panel="Change and convert data")(tools.export_command)
+app.command("import-npz", rich_help_panel="Change and convert data")(import_npz.import_npz_command)
+app.command("import-rosbag", rich_help_panel="Change and convert data")(tools.import_rosbag_command)
+app.command("push", rich_help_panel="Share")(hub.push_command)
+app.command("pull", rich_help_panel="Share")(hub.pull_command)
+app.command("push-model", rich_help_panel="Share")(hub.push_model_command)
+app.add_typer(models.models_app, name="models", rich_help_panel="Models")
+app.add_typer(train.train_app, name="train", rich_help_panel="Models")
+app.command("encode", rich_help_panel="Models")(encode.encode_command)
+app.add_typer(evaluate.evaluate_app, name="evaluate", rich_help_panel="Models")
+app.command("benchmark", rich_help_panel="Drive and score")(benchmark.benchmark_command)
+app.command("reproduce", rich_help_panel="Drive and score")(reproduce.reproduce_command)
+app.command("play", rich_help_panel="Drive and score")(play.play_command)
 
 # Newer typers carry their own click; these are the classes that the installed one raises, whichever that is.
 _UsageError: type[Any] = typer.BadParameter.__mro__[1]

@@ -91,8 +91,8 @@ def filter_command(
     ] = None,
     min_humans: Annotated[int | None, typer.Option("--min-humans", help="Smallest crowd.")] = None,
     max_humans: Annotated[int | None, typer.Option("--max-humans", help="Largest crowd.")] = None,
-    min_steps: Annotated[int | None, typer.Option("--min-steps", help="Shortest episode [steps].")] = None,
-    max_steps: Annotated[int | None, typer.Option("--max-steps", help="Longest episode [steps].")] = None,
+    min_steps: Annotated[int | None, typer.Option("--min-steps", help="Shortest episode \\[steps].")] = None,
+    max_steps: Annotated[int | None, typer.Option("--max-steps", help="Longest episode \\[steps].")] = None,
     as_json: Json = False,
 ) -> None:
     """Keep the episodes that meet all conditions, in a new dataset."""
@@ -189,11 +189,13 @@ def import_rosbag_command(
         typer.Option("--goal-topic", help="Topic of PoseStamped, or none.", show_default='the one named "goal"'),
     ] = None,
     env: Annotated[str, typer.Option("--env", help="Name to record as the environment.")] = "rosbag",
-    dt: Annotated[float, typer.Option("--dt", help="Time between rows [s].")] = 0.2,
+    dt: Annotated[float, typer.Option("--dt", help="Time between rows \\[s].")] = 0.2,
     length: Annotated[int, typer.Option("--length", help="Most rows of a sequence.")] = 1000,
-    range_max: Annotated[float, typer.Option("--range-max", help="Largest range to store [m].")] = 25.0,
-    mount: Annotated[str, typer.Option("--mount", help="Scanner on the robot: x,y,yaw [m, m, rad].")] = "0,0,0",
-    goal_radius: Annotated[float, typer.Option("--goal-radius", help="A goal is reached nearer than this [m].")] = 0.5,
+    range_max: Annotated[float, typer.Option("--range-max", help="Largest range to store \\[m].")] = 25.0,
+    mount: Annotated[str, typer.Option("--mount", help="Scanner on the robot: x,y,yaw \\[m, m, rad].")] = "0,0,0",
+    goal_radius: Annotated[
+        float, typer.Option("--goal-radius", help="A goal is reached nearer than this \\[m].")
+    ] = 0.5,
     assume_same_frame: Annotated[
         bool, typer.Option("--assume-same-frame", help="Goals and odometry are in one frame, whatever it is called.")
     ] = False,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,18 @@ import numpy.typing as npt
 
 from navrep_data.observations import metres_from_millimetres, scan_to_rings
 from navrep_data.schema import Event
-from navrep_data.shards import DatasetFolder, EpisodeWorld
-from navrep_data.sim.drawing import draw_rings, draw_scan, draw_world
+from navrep_data.shards import DatasetFolder, Episodes, EpisodeWorld
+from navrep_data.sim.drawing import OBSTACLE, draw_rings, draw_scan, draw_world, scan_points
 
-FRAMES = 48
-SECONDS_PER_FRAME = 0.12
-COLOURS = 128
+FRAMES = 36
+SECONDS_PER_FRAME = 0.15
+COLOURS = 64
 _SHARE = 0.35  # how far into the episode the still picture is
 _EPISODES_LOOKED_AT = 2000
 _MARGIN = 1.0
+# On maps: how far around the robot's way to show, and which ends of rays are somebody's legs, not walls [m].
+_MAP_MARGIN = 6.0
+_LEGS = 0.4
 # What must be stored to draw a world.
 _NEEDED = ("scan", "humans", "robot_pose", "robot_radius")
 
@@ -53,6 +57,42 @@ class Episode:
             sensor=self.folder.manifest.sensor,
             trail=self.rows["robot_pose"][: row + 1, :2],
         )
+        axes.plot(*self.walls.T, ",", color=OBSTACLE, zorder=2)
+        (left, bottom), (right, top) = self.extent
+        axes.set(xlim=(left, right), ylim=(bottom, top))
+
+    @cached_property
+    def walls(self) -> Array:
+        """What the lidar saw of a map in the whole episode, (n, 2) [m]: datasets on maps do not hold the map itself."""
+        if self.world is None or not self.world.map:
+            return np.empty((0, 2))
+        sensor, rows = self.folder.manifest.sensor, np.linspace(0, len(self) - 1, FRAMES).astype(int)
+        seen = [self._fixed(scan_points(self.metres(k), self.rows["robot_pose"][k], sensor), int(k)) for k in rows]
+        return np.concatenate(seen)
+
+    def _fixed(self, points: Array, row: int) -> Array:
+        """Return those ends of a scan's rays that are on something, and not on somebody."""
+        ranges = self.metres(row)
+        points = points[(ranges > 0) & (ranges < self.folder.manifest.sensor.range_max)]
+        humans = _to_world(self.rows["humans"][row], self.rows["robot_pose"][row])
+        for x, y, _, _, radius, _ in humans[np.isfinite(humans[:, 0])]:
+            points = points[np.hypot(points[:, 0] - x, points[:, 1] - y) > radius + _LEGS]
+        return points
+
+    @cached_property
+    def extent(self) -> tuple[Array, Array]:
+        """What to show: lower left and upper right corner [m]."""
+        assert self.world is not None
+        trail = self.rows["robot_pose"][:, :2]
+        if self.world.map:
+            points = np.concatenate([trail, [self.world.robot_goal]])
+            middle = (points.min(axis=0) + points.max(axis=0)) / 2
+            points, margin = np.stack([middle, middle]), _MAP_MARGIN + np.ptp(points, axis=0).max() / 2  # a square
+        elif self.world.border is not None:
+            points, margin = self.world.border, _MARGIN
+        else:
+            points, margin = np.concatenate([*self.world.polygons, trail]), _MARGIN
+        return points.min(axis=0) - margin, points.max(axis=0) + margin
 
     def metres(self, row: int) -> Array:
         scan = self.rows["scan"][row]
@@ -73,7 +113,7 @@ def draw_pictures(folder: DatasetFolder) -> dict[str, bytes]:
 
 
 def _choose(folder: DatasetFolder) -> Episode | None:
-    """Return the longest of the first episodes that reached its goal, or of all if none did."""
+    """Return the longest of the first episodes that reached the goal, else of all; on maps the most crowded."""
     if folder.manifest.sensor.n_rays < 2:
         return None
     e = folder.episodes
@@ -82,7 +122,12 @@ def _choose(folder: DatasetFolder) -> Episode | None:
     candidates = reached if len(reached) else looked
     if not len(candidates):
         return None
-    episode = read_episode(folder, int(candidates[np.argmax(e.length[candidates])]))
+    k = int(candidates[np.argmax(e.length[candidates])])
+    if folder.manifest.config.get("world") == "map" and "humans" in folder.manifest.columns:
+        # the longest are on ways so long that nobody can be made out: the largest crowd of the first shard
+        candidates = candidates[e.shard[candidates] == e.shard[candidates[0]]]
+        k = int(max(candidates, key=lambda i: (_crowd(folder, e, i), e.length[i])))
+    episode = read_episode(folder, k)
     return None if episode.world is None else episode
 
 
@@ -95,6 +140,12 @@ def read_episode(folder: DatasetFolder, k: int) -> Episode:
     if worlds is None or not np.isfinite(rows["robot_pose"]).all():  # imports do not know it
         return Episode(rows, None, folder)
     return Episode(rows, worlds.episode(int(np.flatnonzero(worlds.arrays["row"] == start)[0])), folder)
+
+
+def _crowd(folder: DatasetFolder, episodes: Episodes, k: int) -> int:
+    """Return the number of humans in an episode."""
+    start, shard = int(episodes.start[k]), int(episodes.shard[k])
+    return int(np.isfinite(folder.read("humans", shard, start, start + 1)[0, :, 0]).sum())
 
 
 def _to_world(humans: Array, pose: Array) -> Array:
@@ -140,15 +191,10 @@ def _frames(episode: Episode) -> Iterator[Any]:
 
     assert episode.world is not None
     figure, axes = _figure(6.4, 3.2, "WR", 80, (1.0, 1.0))
-    points = np.concatenate([np.asarray(p) for p in (*episode.world.polygons, episode.rows["robot_pose"][:, :2])])
-    if episode.world.border is not None:
-        points = episode.world.border
-    low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
     for row in np.unique(np.linspace(0, len(episode) - 1, FRAMES).astype(int)):
         for one in axes.values():
             one.clear()
         episode.draw_world(axes["W"], int(row))
-        axes["W"].set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         draw_rings(axes["R"], episode.rings(int(row)))
         for one in axes.values():
             one.set(xticks=[], yticks=[], xlabel="", ylabel="")

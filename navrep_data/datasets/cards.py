@@ -4,26 +4,49 @@ Notes
 -----
 A card is a function of a manifest, so the manifests of what is published are kept beside the cards, with the pictures;
 tests check that the cards are what this module makes of them, that the pictures are those the manifests list, and
-that the package still generates the rows whose hashes the manifests hold. To add or renew one, add its line to
-:data:`PUBLISHED`, generate the dataset and run
-``python -m navrep_data.datasets.cards cards/datasets --from DIR``.
+that the package still generates the rows whose hashes the manifests hold. To add or renew one, change
+:data:`PUBLISHED` and run ``make cards``, which generates the datasets first.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from navrep_data.datasets.hub import published
 from navrep_data.errors import ConfigError
 from navrep_data.io import atomic_write_bytes, json_bytes, read_json
-from navrep_data.shards import MANIFEST_FILE, Manifest, dataset_card
+from navrep_data.shards import Manifest, dataset_card
+
+
+@dataclass(frozen=True)
+class Published:
+    """A dataset that we publish.
+
+    Attributes
+    ----------
+    command : str
+        What generates it.
+    license : str
+        Identifier as on the Hub.
+    """
+
+    command: str
+    license: str
+
 
 PUBLISHED = {
-    "soadrl": "mit",
+    "soadrl": Published("navrep-data generate --env soadrl --n 1000 --seed 0", "mit"),
+    "navrep-train": Published("navrep-data generate --env navrep-train --n 200 --seed 0", "mit"),
+    # other: its maps are those of asl-pepper-2d-sim, which states no licence; the card says so
+    "ian": Published("navrep-data generate --env ian --n 200 --seed 0", "other"),
 }
-"""Environments whose datasets we publish, and under which licence: one line each."""
+"""Environments whose datasets we publish: for world models, of the paper's training, and of its test on maps."""
 MEDIA = "media"
 
 
@@ -63,8 +86,8 @@ def add(folder: Path, root: Path) -> Path:
     """
     env = Manifest.read(root).env
     if env not in PUBLISHED:
-        raise ConfigError(f"{root} is a dataset of {env}, which is not in PUBLISHED: add its line, with a licence.")
-    manifest, files = published(root, PUBLISHED[env])
+        raise ConfigError(f"{root} is a dataset of {env}, which is not in PUBLISHED: add its line.")
+    manifest, files = published(root, PUBLISHED[env].license)
     (folder / MEDIA).mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         if name.startswith(f"{MEDIA}/"):
@@ -74,14 +97,34 @@ def add(folder: Path, root: Path) -> Path:
     return path
 
 
+def generate(data: Path, envs: Iterable[str]) -> list[Path]:
+    """Generate published datasets into folders in `data`; what is there already is gone on with.
+
+    Returns
+    -------
+    list of pathlib.Path
+        Their folders.
+    """
+    roots = []
+    for env in envs:
+        root = data / env
+        # a process of its own: this layer does not import the generators
+        words = [sys.executable, "-m", "navrep_data", *shlex.split(PUBLISHED[env].command)[1:], "--out", str(root)]
+        subprocess.run(words, check=True)
+        roots.append(root)
+    return roots
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description="Write the cards of the datasets that this project publishes.")
     parser.add_argument("folder", type=Path, help="cards/datasets of a checkout")
-    parser.add_argument("--from", dest="root", type=Path, help=f"dataset folder: take over its {MANIFEST_FILE} first")
+    parser.add_argument("--data", type=Path, help="generate the datasets here first, and take over what they hold")
+    parser.add_argument("--only", nargs="+", choices=list(PUBLISHED), default=list(PUBLISHED), help="with --data")
     options = parser.parse_args(arguments)
-    if options.root is not None:
-        print(add(options.folder, options.root))
+    if options.data is not None:
+        for root in generate(options.data, options.only):
+            print(add(options.folder, root))
     for path in write_cards(options.folder):
         print(path)
 

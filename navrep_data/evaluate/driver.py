@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from navrep_data._ray import RayCluster
 from navrep_data.errors import ConfigError, DatasetNotFoundError
 from navrep_data.evaluate import tables
-from navrep_data.evaluate.executors import Job, run
+from navrep_data.evaluate.executors import Job, run, run_on_ray
 from navrep_data.evaluate.policies import PilotSpec, resolve_policy
 from navrep_data.evaluate.results import Results, file_name, header_of, open_results
+from navrep_data.evaluate.runner import Episode
 from navrep_data.evaluate.scores import by_variant, summary
 from navrep_data.evaluate.suites import Suite, get_suite
+from navrep_data.generate.executors import EXECUTORS
 from navrep_data.io import atomic_write_bytes, translate_os_error
 
 PHYSICS = ("original", "consistent")
 SAVE_SECONDS = 2.0
 """The results file is written this often at most while episodes finish."""
 MAX_WORKERS = 1024
+NETWORKS = ("zoo", "folder")
+"""Kinds of policies for which `inference` means something."""
 
 Progress = Callable[[str, int, int], None]
 """Called with a policy's name, how many of its episodes are finished, and of how many."""
@@ -71,12 +77,14 @@ def benchmark(
     suite: str = "navreptest",
     physics: str | None = None,
     episodes: int | None = None,
-    workers: int = 1,
+    workers: int | None = None,
     inference: str = "deterministic",
     source: str | os.PathLike[str] | None = None,
     out: str | os.PathLike[str] = "benchmark",
     figures: bool = True,
     batch: int | None = None,
+    executor: str = "local",
+    address: str | None = None,
     progress: Progress | None = None,
 ) -> Benchmark:
     """Play policies in a suite; the same call goes on after an interruption, or with more episodes.
@@ -84,7 +92,8 @@ def benchmark(
     Parameters
     ----------
     policies : sequence of str or callable
-        Baselines (``goal``, ``random``, ``orca``, ``dwa``), names of the zoo, ``module:function``, or callables
+        Baselines (``goal``, ``random``, ``orca``, ``dwa``), names of the zoo, folders of policies (``./folder``,
+        ``hf://user/name``), ``module:function``, or callables
         ``(scan (64, 1080), robot_state (64, 5)) -> action (64, 2 or 3)`` in [-1, 1]. `goal` is always played.
     suite : str
         ``"navreptest"`` or ``"navrep27"``.
@@ -92,8 +101,9 @@ def benchmark(
         ``"original"`` (the suites' default) or ``"consistent"``.
     episodes : int, optional
         Episodes per scenario; the suite's own number by default.
-    workers : int
-        Processes; numbers do not depend on it.
+    workers : int, optional
+        Processes, 1 by default; numbers do not depend on it. On Ray: most tasks at the same time, by default all that
+        the cluster takes.
     inference : str
         ``"deterministic"``, or ``"as_released"``: the zoo's memories with the noise that they were trained with.
     source : path-like or str, optional
@@ -104,6 +114,10 @@ def benchmark(
         Whether to draw.
     batch : int, optional
         Worlds per process; numbers do not depend on it.
+    executor : {"local", "ray"}
+        Where to play: on this machine, or as tasks of a Ray cluster (needs the extra ``ray``).
+    address : str, optional
+        The Ray cluster's ``host:port``, or ``auto``; by default ``RAY_ADDRESS``, or a cluster on this machine alone.
     progress : callable, optional
         Called with a policy's name, how many of its episodes are finished, and of how many.
 
@@ -117,15 +131,21 @@ def benchmark(
         If a name or setting cannot be used.
     DatasetMismatchError
         If `out` holds results of other settings.
+    MissingExtraError, ClusterError
+        If there is no Ray, or no cluster at the address.
     """
     chosen = get_suite(suite)
     kind = chosen.physics if physics is None else physics
     _check(kind, workers, batch, policies)
+    if executor not in EXECUTORS:
+        raise ConfigError(f"executor is {executor!r}, expected one of: {', '.join(EXECUTORS)}.")
+    if address is not None and executor != "ray":
+        raise ConfigError(f"address is {address}, which only Ray needs; expected executor ray with it.")
     total = chosen.total(episodes)
     specs = list(
         {s.name: s for s in (resolve_policy(p, source, inference, bool(chosen.maps)) for p in policies)}.values()
     )
-    specs = [s if s.kind == "zoo" else _plain(s) for s in specs]
+    specs = [s if s.kind in NETWORKS else _plain(s) for s in specs]
     everybody = specs if any(s.name == "goal" for s in specs) else [resolve_policy("goal"), *specs]
     folder = Path(out) / f"{chosen.name}-{kind}"
     try:
@@ -135,11 +155,15 @@ def benchmark(
     # settings are compared before the first episode is played
     opened = [(s, open_results(folder / file_name(s), header_of(s, chosen, kind))) for s in everybody]
     seconds, found = {}, {}
-    for spec, results in opened:
-        begun = time.perf_counter()
-        played = _play(chosen, kind, spec, results, total, folder / file_name(spec), workers, batch, progress)
-        seconds[spec.name] = round(time.perf_counter() - begun, 2) if played else 0.0
-        found[spec.name] = results.first(total)
+    place: AbstractContextManager[RayCluster[tuple[int, ...], list[Episode]] | None]
+    place = RayCluster(address, workers) if executor == "ray" else nullcontext()
+    with place as cluster:
+        play = (lambda job: run(job, workers or 1)) if cluster is None else (lambda job: run_on_ray(job, cluster))
+        for spec, results in opened:
+            begun = time.perf_counter()
+            played = _play(chosen, kind, spec, results, total, folder / file_name(spec), batch, play, progress)
+            seconds[spec.name] = round(time.perf_counter() - begun, 2) if played else 0.0
+            found[spec.name] = results.first(total)
     report = write_report(list(found.values()), folder, figures, [s.name for s in specs])
     report.files = [*(folder / file_name(s) for s in everybody), *report.files]
     report.seconds = seconds
@@ -151,10 +175,13 @@ def _plain(spec: PilotSpec) -> PilotSpec:
     return PilotSpec(spec.name, spec.sees, spec.variant, spec.kind, files=spec.files, function=spec.function)
 
 
-def _check(physics: str, workers: int, batch: int | None, policies: Sequence[Any]) -> None:
+def _check(physics: str, workers: int | None, batch: int | None, policies: Sequence[Any]) -> None:
     if physics not in PHYSICS:
         raise ConfigError(f"physics is {physics!r}, expected one of: {', '.join(PHYSICS)}.")
-    for name, value, most in (("workers", workers, MAX_WORKERS), ("batch", 1 if batch is None else batch, 4096)):
+    for name, value, most in (
+        ("workers", 1 if workers is None else workers, MAX_WORKERS),
+        ("batch", 1 if batch is None else batch, 4096),
+    ):
         if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
             raise ConfigError(f"{name} is {value!r}, expected a whole number from 1 to {most}.")
     if not policies or isinstance(policies, str):
@@ -168,18 +195,18 @@ def _play(
     results: Results,
     total: int,
     path: Path,
-    workers: int,
     batch: int | None,
+    play: Callable[[Job], Iterator[list[Episode]]],
     progress: Progress | None,
 ) -> bool:
     """Play what is missing, saving as episodes finish; returns whether anything was."""
     todo = results.missing(total)
     if not todo:
         return False
-    job = Job(suite.name, physics, spec, tuple(todo), spec.inference == "as_released" and spec.kind == "zoo", batch)
+    job = Job(suite.name, physics, spec, tuple(todo), spec.inference == "as_released" and spec.kind in NETWORKS, batch)
     done, saved = total - len(todo), time.monotonic()
     try:
-        for finished in run(job, workers):
+        for finished in play(job):
             results.add(finished)
             done += len(finished)
             if progress is not None:

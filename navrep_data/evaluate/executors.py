@@ -1,4 +1,4 @@
-"""Play episodes here, or in worker processes that take one episode after the other from a common list."""
+"""Play episodes here, in worker processes that take one after the other from a common list, or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
 from typing import Any
 
+from navrep_data._ray import RayCluster
 from navrep_data.errors import NavrepDataError, WorkerDiedError
 from navrep_data.evaluate.policies import PilotSpec
 from navrep_data.evaluate.runner import Episode, n_worlds, play, units
@@ -18,6 +19,10 @@ from navrep_data.evaluate.suites import Suite, get_suite
 POLL_SECONDS = 0.2
 # workers hand over what they have finished this often, so that little is lost when they are killed
 HAND_OVER_SECONDS = 0.5
+# On Ray a task is some units, played to their end: few enough that all processors end at about the same time and
+# little is played again where a node dies, enough that networks see batches.
+TASKS_PER_CPU = 4
+MAX_EPISODES_PER_TASK = 128
 
 
 @dataclass(frozen=True)
@@ -149,3 +154,36 @@ def _check_alive(pool: list[Any]) -> None:
                 f"A worker process died (exit code {process.exitcode}: killed, or out of memory?). What was finished "
                 "is intact; run the same command again, perhaps with fewer --workers."
             )
+
+
+def run_on_ray(job: Job, cluster: RayCluster[tuple[int, ...], list[Episode]]) -> Iterator[list[Episode]]:
+    """Play a job on a cluster and yield episodes as tasks end, in any order; empty lists while waiting.
+
+    Parameters
+    ----------
+    job : Job
+        What to play; what it names (modules, files of weights) must be there on every node.
+    cluster : RayCluster
+        Entered.
+
+    Raises
+    ------
+    WorkerDiedError, ClusterError
+        See :meth:`navrep_data._ray.RayCluster.map`.
+    NavrepDataError
+        What went wrong in a worker.
+    """
+    todo = job.units()
+    size = max(1, min(-(-len(todo) // (TASKS_PER_CPU * cluster.cpus)), MAX_EPISODES_PER_TASK // max(map(len, todo))))
+    tasks = [tuple(range(k, min(k + size, len(todo)))) for k in range(0, len(todo), size)]
+    for done in cluster.map(_play_task, job, tasks):
+        yield [] if done is None else done[1]
+
+
+def _play_task(job: Job, chosen: tuple[int, ...]) -> list[Episode]:
+    """Play some of a job's units in a worker of a cluster."""
+    todo = job.units()
+    mine = [todo[k] for k in chosen]
+    rest = iter(mine)
+    played = _start(job, get_suite(job.suite), lambda: next(rest, None), sum(map(len, mine)))
+    return [episode for finished in played for episode in finished]

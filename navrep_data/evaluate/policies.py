@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from navrep_data.errors import ConfigError, PolicyError, UnknownNameError, did_you_mean
 from navrep_data.evaluate.baselines import DwaPilot, GoalPilot, OrcaPilot, RandomPilot
 from navrep_data.evaluate.pilots import FunctionPilot, Pilot, ZooPilot, source_hash
 from navrep_data.generate.policy import load_callable
+from navrep_data.io import sha256_file
+from navrep_data.zoo.folders import is_path, policy_files
 
 BASELINES: dict[str, type[Pilot]] = {pilot.name: pilot for pilot in (GoalPilot, RandomPilot, OrcaPilot, DwaPilot)}
 """Policies without weights, by name."""
@@ -31,9 +34,9 @@ class PilotSpec:
     variant : str
         What runs of one kind share, such as ``e2e_1d``; the name itself for others.
     kind : str
-        baseline, zoo or function.
+        baseline, zoo, folder or function.
     source : str or None
-        Where files are looked for first.
+        Where files are looked for first; for a folder, the folder.
     inference : str
         deterministic or as_released.
     files : dict
@@ -62,6 +65,8 @@ class PilotSpec:
         from navrep_data.zoo import load
 
         torch.set_num_threads(1)  # so that numbers do not depend on the number of cores; workers are the parallelism
+        if self.kind == "folder":
+            return ZooPilot(load(Path(str(self.source)), inference=self.inference), first_seed)
         return ZooPilot(load(self.name, source=self.source, inference=self.inference), first_seed)
 
 
@@ -76,7 +81,9 @@ def resolve_policy(
     Parameters
     ----------
     policy : str or callable
-        A baseline's name, a name of the zoo, ``module:function``, or a callable (scan, robot_state) -> action.
+        A baseline's name, a name of the zoo, the folder of a policy (``./folder``, written by
+        ``navrep-data train controller`` or :func:`navrep_data.zoo.save_policy`), ``hf://user/name``,
+        ``module:function``, or a callable (scan, robot_state) -> action.
     source : path-like or str, optional
         Folder or address with the zoo's files.
     inference : str
@@ -92,6 +99,8 @@ def resolve_policy(
         If `inference` is unknown.
     PolicyError
         If the name is that of a network that is no policy.
+    ModelNotFoundError, CheckpointError
+        If there is no policy in the folder, or it cannot be loaded.
     """
     if inference not in INFERENCE:
         raise ConfigError(f"inference is {inference!r}, expected one of: {', '.join(INFERENCE)}.")
@@ -102,6 +111,8 @@ def resolve_policy(
     if policy in BASELINES:
         pilot = BASELINES[policy]
         return PilotSpec(policy, (on_maps and pilot.sees_on_maps) or pilot.sees, policy, "baseline")
+    if is_path(policy):
+        return _from_folder(policy, inference)
     if ":" in policy:
         return PilotSpec(policy, "scan", policy, "function", files=_hashes(load_callable(policy, BASELINES)))
     return _from_zoo(policy, None if source is None else os.fspath(source), inference)
@@ -112,6 +123,28 @@ def _hashes(function: Callable[..., Any]) -> dict[str, str]:
     return {"source": digest} if digest else {}
 
 
+def _from_folder(name: str, inference: str) -> PilotSpec:
+    from navrep_data.zoo import load
+    from navrep_data.zoo.fetching import HUB_SCHEME
+    from navrep_data.zoo.policy import Policy
+
+    if name.startswith(HUB_SCHEME):
+        from navrep_data.zoo.hub import fetch_model
+
+        folder = fetch_model(name)
+    else:
+        folder = Path(name).expanduser().resolve()
+        name = os.path.normpath(name)
+    loaded = load(folder)  # told before the first episode is played
+    if not isinstance(loaded, Policy):
+        raise PolicyError(
+            f"{name} holds a {type(loaded).__name__}, expected a policy, for example what navrep-data train controller "
+            "wrote."
+        )
+    files = {part: sha256_file(path) for part, path in policy_files(folder).items()}
+    return PilotSpec(name, "scan", name, "folder", str(folder), inference, files)
+
+
 def _from_zoo(name: str, source: str | None, inference: str) -> PilotSpec:
     from navrep_data.zoo import registry
 
@@ -119,7 +152,7 @@ def _from_zoo(name: str, source: str | None, inference: str) -> PilotSpec:
         known = [*BASELINES, *registry.full_names(), *registry.variants()]
         raise UnknownNameError(
             f"Unknown policy {name!r}.{did_you_mean(name, known)} Baselines: {', '.join(BASELINES)}; networks: "
-            "navrep-data models; your own: module:function."
+            "navrep-data models; your own: ./folder or module:function."
         )
     record = registry.resolve(name)
     if record.kind != "policy":

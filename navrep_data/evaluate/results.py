@@ -242,5 +242,6 @@ def _short(value: Any) -> str:
 
 def file_name(spec: PilotSpec) -> str:
     """Return the name of a policy's results file."""
-    plain = "".join(c if c.isalnum() or c in "._-" else "-" for c in spec.name)
+    # a folder's name may begin with dots, and files that do are hidden
+    plain = "".join(c if c.isalnum() or c in "._-" else "-" for c in spec.name).lstrip(".-") or "policy"
     return f"{plain}.{spec.inference}.json" if spec.inference != "deterministic" else f"{plain}.json"

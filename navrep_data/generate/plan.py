@@ -18,9 +18,12 @@ from navrep_data.errors import (
     FolderInUseError,
     FolderNotWritableError,
 )
+from navrep_data.generate.parts import PARTS, Part
 from navrep_data.generate.policy import PolicySpec
-from navrep_data.generate.worker import STAGING, DatasetSpec
+from navrep_data.generate.storage import STAGING
+from navrep_data.generate.worker import DatasetSpec
 from navrep_data.io import PART_SUFFIX
+from navrep_data.io._files import MAX_JSON_BYTES
 from navrep_data.schema import COLUMNS, UINT16_RANGE_LIMIT
 from navrep_data.shards import LOCK_FILE, MANIFEST_FILE, MAX_SHARD_BYTES, Manifest, estimate_bytes
 from navrep_data.sim import RolloutSettings, SimConfig
@@ -32,6 +35,9 @@ MAX_SEQUENCES = 2**31 - 1
 MAX_LENGTH = 100_000
 # An estimate of compressed size is good to a few per cent; ask for a little more.
 DISK_MARGIN = 1.1
+# What a manifest lists: names, hashes and statistics per shard, a hash per sequence (measured: 6.1 kB and 72 bytes).
+_MANIFEST_SHARD_BYTES = 6_500
+_MANIFEST_SEQUENCE_BYTES = 75
 _GENERATED_COLUMNS = tuple(name for name in COLUMNS if not name.startswith(("leading_", "source_")))
 
 
@@ -43,16 +49,38 @@ class Request:
     n: int
     shard_size: int
     command: str
+    part: Part | None = None
+
+    @property
+    def home(self) -> Path:
+        """The folder of the manifest: the dataset's own, but for parts."""
+        return self.spec.root if self.part is None else self.spec.root / self.part.folder
+
+    @property
+    def shards(self) -> range:
+        """The numbers of the shards that are asked for: all, but for parts."""
+        count = -(-self.n // self.shard_size)
+        return range(count) if self.part is None else self.part.shards(count)
+
+    @property
+    def sequences(self) -> int:
+        """Number of sequences in these shards."""
+        return min(self.shards.stop * self.shard_size, self.n) - min(self.shards.start * self.shard_size, self.n)
 
     @property
     def rows(self) -> int:
-        """Rows of the finished dataset."""
-        return self.n * self.spec.settings.length
+        """Rows of the finished dataset, or part."""
+        return self.sequences * self.spec.settings.length
 
     @property
     def bytes(self) -> int:
-        """Estimated bytes of the finished dataset."""
+        """Estimated bytes of the finished dataset, or part."""
         return int(self.rows * bytes_per_row(self.spec))
+
+
+def largest_shard(spec: DatasetSpec) -> int:
+    """Return how many sequences a shard may have: it is built in memory."""
+    return max(1, int(MAX_SHARD_BYTES / (bytes_per_row(spec) * spec.settings.length)))
 
 
 def bytes_per_row(spec: DatasetSpec) -> float:
@@ -93,7 +121,7 @@ def check_settings(
 
 def make_request(
     root: Path, config: SimConfig, settings: RolloutSettings, policy: PolicySpec, seed: int, n: int,
-    shard_size: int | None, command: str,
+    shard_size: int | None, storage: str | None = None, part: Part | None = None,
 ) -> Request:  # fmt: skip
     """Return the checked request; chooses the shard size where none is given."""
     check_count("n", n, 1, MAX_SEQUENCES)
@@ -102,8 +130,8 @@ def make_request(
         for name in _GENERATED_COLUMNS
         if (name != "rings" or settings.rings) and (name != "humans" or settings.humans)
     )
-    spec = DatasetSpec(root, config, settings, policy, seed, columns)
-    largest = max(1, int(MAX_SHARD_BYTES / (bytes_per_row(spec) * settings.length)))
+    spec = DatasetSpec(root, config, settings, policy, seed, columns, storage)
+    largest = largest_shard(spec)
     if shard_size is None:
         shard_size = min(largest, max(policy.batch, DEFAULT_SHARD_ROWS // settings.length, 1))
     elif check_count("shard-size", shard_size, 1, MAX_SEQUENCES) > largest:
@@ -111,7 +139,29 @@ def make_request(
             f"--shard-size is {shard_size}, expected at most {largest} sequences of {settings.length} rows: a shard is "
             f"built in memory and may take {MAX_SHARD_BYTES >> 20} MiB."
         )
-    return Request(spec, n, shard_size, command)
+    return Request(spec, n, shard_size, "", part)
+
+
+def check_manifest(request: Request) -> None:
+    """Refuse what would end, after days perhaps, in a manifest that is too large to be read.
+
+    Raises
+    ------
+    ConfigError
+        Naming a shard size that will do.
+    """
+    hashes = request.n * _MANIFEST_SEQUENCE_BYTES
+    if hashes - (-request.n // request.shard_size) * _MANIFEST_SHARD_BYTES <= MAX_JSON_BYTES:
+        return
+    room = (MAX_JSON_BYTES - hashes) // _MANIFEST_SHARD_BYTES
+    enough = -(-request.n // room) if room > 0 else request.n
+    todo = f"give --shard-size {enough} or more"
+    if enough > largest_shard(request.spec):
+        todo = "make several datasets, or longer sequences"
+    raise ConfigError(
+        f"{request.n:,} sequences in shards of {request.shard_size} would need a manifest larger than "
+        f"{MAX_JSON_BYTES >> 20} MiB, the most that is read: {todo}."
+    )
 
 
 def versions() -> dict[str, str]:
@@ -149,8 +199,10 @@ def new_manifest(request: Request) -> Manifest:
     )
 
 
-def check_folder(root: Path) -> None:
+def check_folder(root: Path, part: Part | None = None) -> None:
     """Make sure that `root` is a folder of ours, empty, or can be made.
+
+    For a part of a job array, its own folder is made as well.
 
     Raises
     ------
@@ -161,6 +213,9 @@ def check_folder(root: Path) -> None:
     """
     try:
         root.mkdir(parents=True, exist_ok=True)
+        others = {p.name for p in root.iterdir()}
+        if part is not None and (PARTS in others or not others - {LOCK_FILE}):
+            (root / part.folder).mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise FolderInUseError(f"{root} is or lies under a file, expected a folder; choose another --out.") from None
     except OSError as error:
@@ -169,8 +224,15 @@ def check_folder(root: Path) -> None:
         ) from error
     if (root / MANIFEST_FILE).exists():
         return
+    if PARTS in others:
+        if part is None:
+            raise FolderInUseError(
+                f"{root} holds parts of a job array; expected --shard-range to go on with them. Once all are there: "
+                f"navrep-data merge-manifest {root}"
+            )
+        return
     own = {LOCK_FILE, STAGING}
-    other = sorted(p.name for p in root.iterdir() if p.name not in own and not p.name.endswith(PART_SUFFIX))
+    other = sorted(name for name in others if name not in own and not name.endswith(PART_SUFFIX))
     if other:
         raise FolderInUseError(
             f"{root} holds something else ({', '.join(other[:3])}{', ...' if len(other) > 3 else ''}) and no "
@@ -228,10 +290,12 @@ def check_space(request: Request, done_rows: int) -> None:
     DiskSpaceError
         Naming both sizes.
     """
+    if request.spec.storage is not None:
+        return  # nobody can tell how much room is behind a URL
     needed = int((request.rows - done_rows) * bytes_per_row(request.spec) * DISK_MARGIN)
     free = shutil.disk_usage(request.spec.root).free
     if needed > free:
         raise DiskSpaceError(
             f"{request.spec.root} has {free / 1e9:.2f} GB free, about {needed / 1e9:.2f} GB are needed for "
-            f"{request.n} sequences; free some space, choose another --out or a smaller --n."
+            f"{request.sequences} sequences; free some space, choose another --out or a smaller --n."
         )

@@ -13,13 +13,17 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data.generate.policy import PolicySpec, make_rollout
-from navrep_data.shards import ShardEntry, ShardWriter, publish
+from navrep_data.generate.storage import Store, store_of
+from navrep_data.shards import ShardEntry, ShardWriter
 from navrep_data.sim import CallableRollout, RolloutSettings, ScriptedRollout, SimConfig
 
 
 @dataclass(frozen=True)
 class DatasetSpec:
-    """Everything that determines the bytes of a dataset's shards, and where they go."""
+    """Everything that determines the bytes of a dataset's shards, and where they go.
+
+    Shards go to the URL `storage`, or to `root` where there is none.
+    """
 
     root: Path
     config: SimConfig
@@ -27,6 +31,12 @@ class DatasetSpec:
     policy: PolicySpec
     seed: int
     columns: tuple[str, ...]
+    storage: str | None = None
+
+    @property
+    def store(self) -> Store:
+        """Where shards go."""
+        return store_of(self.root, self.storage)
 
 
 @dataclass(frozen=True)
@@ -39,9 +49,6 @@ class ShardTask:
     slot: int = 0
     staged: bool = False
 
-
-STAGING = ".staging"
-"""Where a shard that replaces a shorter one waits until the manifest has let go of the old one."""
 
 # Enough for an estimate to within the machine's own noise, and done before one notices.
 PILOT_ROWS = 400
@@ -120,9 +127,7 @@ def make_shard(
         for columns, worlds in rollout.run(group):
             writer.append(columns, worlds)
             report(spec.settings.length)
-    root = spec.root / STAGING if task.staged else spec.root
-    root.mkdir(exist_ok=True)
-    return publish(root, task.index, writer.finish())
+    return spec.store.publish(task.index, writer.finish(), staged=task.staged)
 
 
 def new_writer(spec: DatasetSpec, first_sequence: int) -> ShardWriter:

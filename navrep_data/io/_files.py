@@ -8,6 +8,7 @@ import json
 import math
 import os
 import re
+import secrets
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,7 +18,7 @@ from navrep_data.errors import CorruptDataError, DatasetError, DiskSpaceError, F
 
 PART_SUFFIX = ".part"
 HASH_BLOCK = 1 << 20
-# A manifest of 100,000 shards is about 60 MB; anything larger is not one of ours.
+# A manifest of 35,000 shards of 20 sequences is about this large; generate refuses to make a larger one.
 MAX_JSON_BYTES = 256 << 20
 # A list or object takes 60 bytes or more, as text two: files of this package have 20 characters for each.
 _FREE_CONTAINERS, _BYTES_PER_CONTAINER = 1 << 16, 8
@@ -87,8 +88,8 @@ def atomic_write_bytes(path: Path | str, data: bytes | memoryview) -> None:
         If the folder cannot be written.
     """
     path = Path(path)
-    # unique per process: an orphan of a killed run must never write into our temp file
-    part = path.with_name(f".{path.name}.{os.getpid()}{PART_SUFFIX}")
+    # unique, also among machines that share the folder: an orphan of a killed run must never write into our temp file
+    part = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}{PART_SUFFIX}")
     try:
         with open(part, "wb") as handle:
             handle.write(data)

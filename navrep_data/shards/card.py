@@ -66,6 +66,15 @@ def split_note(m: Manifest) -> str:
     return "Each shard belongs to one split, and the Hub's viewer shows them so."
 
 
+def _configs(m: Manifest) -> list[dict[str, Any]]:
+    """Return the configs of the datasets that this one was made out of, or its own: theirs share what is in its own."""
+    return [c if isinstance(c := record.get("config"), dict) else m.config for record in m.source] or [m.config]
+
+
+def _orca(m: Manifest) -> list[str]:
+    return ["orca"] if any(c.get("human_policy", "orca") == "orca" for c in _configs(m)) else []
+
+
 def _front_matter(m: Manifest) -> str:
     lines = [
         "---",
@@ -75,7 +84,7 @@ def _front_matter(m: Manifest) -> str:
         "- reinforcement-learning",
         "- robotics",
         "tags:",
-        *(f"- {tag}" for tag in ("navrep", "robot-navigation", "lidar", "crowd", "orca", "world-models", "hdf5")),
+        *(f"- {tag}" for tag in ("navrep", "robot-navigation", "lidar", "crowd", *_orca(m), "world-models", "hdf5")),
         "size_categories:",
         f"- {_size_category(m.rows)}",
         "configs:",
@@ -193,8 +202,7 @@ def _sources(m: Manifest) -> str:
 
 
 def _limits(m: Manifest) -> str:
-    # of several datasets made into one, `config` has what they share; what differs is with each
-    configs = [c if isinstance(c := record.get("config"), dict) else m.config for record in m.source] or [m.config]
+    configs = _configs(m)
     noise = "with noise" if any(c.get("scan_noise") or c.get("scan_dropout") for c in configs) else "without noise"
     walks = [_HUMANS.get(str(c.get("human_policy", "orca")), "humans that follow a script") for c in configs]
     lines = [f"* Simulated: flat ground, a planar lidar {noise}, {' or '.join(dict.fromkeys(walks))}."]
@@ -236,6 +244,7 @@ def dataset_card(manifest: Manifest) -> str:
         else ""
     )
     splits = [(n, f"{sum(b - a for a, b in m.splits.get(n, ())):,}") for n in SPLITS]
+    scene = "map" if m.config.get("world") == "map" else "obstacles"
     command = m.command or "(not recorded)"
     versions = ", ".join(f"{k} {v}" for k, v in m.versions.items())
     return f"""{_front_matter(m)}
@@ -268,7 +277,7 @@ anticlockwise; up to {m.sensor.range_max:g} m; one step is {m.sensor.dt:g} s.
 
 {_columns_table(all_layouts)}
 
-`worlds/` holds the obstacles, goals and start states of each episode, one npz per shard.
+`worlds/` holds the {scene}, goals and start states of each episode, one npz per shard.
 
 ## Outcomes
 

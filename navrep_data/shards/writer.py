@@ -391,19 +391,29 @@ def publish(root: Path | str, index: int, image: ShardImage) -> ShardEntry:
         If it cannot be written; what was there before is intact.
     """
     root = Path(root)
-    data, worlds = shard_file(index), None
     try:
-        (root / data).parent.mkdir(exist_ok=True)
-        if image.worlds is not None:
-            (root / worlds_file(index)).parent.mkdir(exist_ok=True)
+        for file, _ in shard_files(index, image):
+            (root / file).parent.mkdir(exist_ok=True)
     except OSError as error:
         raise translate_os_error(error, root) from error
+    for file, content in shard_files(index, image):
+        atomic_write_bytes(root / file, content)
+    return shard_entry(index, image)
+
+
+def shard_files(index: int, image: ShardImage) -> list[tuple[str, bytes]]:
+    """Return names and contents of a shard's files, in the order in which to write them: worlds first."""
+    worlds = [] if image.worlds is None else [(worlds_file(index), image.worlds)]
+    return [*worlds, (shard_file(index), image.data)]
+
+
+def shard_entry(index: int, image: ShardImage) -> ShardEntry:
+    """Return what the manifest lists of a shard that is in its place."""
+    worlds = None
     if image.worlds is not None and image.worlds_sha256 is not None:
-        atomic_write_bytes(root / worlds_file(index), image.worlds)
         worlds = FileEntry(worlds_file(index), image.worlds_sha256, len(image.worlds))
-    atomic_write_bytes(root / data, image.data)
     return ShardEntry(
-        file=data,
+        file=shard_file(index),
         sha256=image.data_sha256,
         bytes=len(image.data),
         rows=image.rows,

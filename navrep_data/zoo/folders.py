@@ -196,6 +196,21 @@ def is_training(path: Path) -> bool:
     return (path / POLICY_FILE).is_file() and (path / WEIGHTS_NAME).is_file()
 
 
+def policy_files(path: Path) -> dict[str, Path]:
+    """Return the files that decide what the policy in a folder does, by their names below it.
+
+    Parameters
+    ----------
+    path : Path
+        Policy folder, output folder of a training, or a folder with the checkpoint of an end-to-end network.
+    """
+    from navrep_data.models.checkpoint import CONFIG_NAME, WEIGHTS_NAME
+
+    parts = [path, *(path / part for part in PART_FOLDERS)]
+    found = [path / POLICY_FILE, *(part / name for part in parts for name in (CONFIG_NAME, WEIGHTS_NAME))]
+    return {file.relative_to(path).as_posix(): file for file in found if file.is_file()}
+
+
 def _files(path: Path) -> dict[str, Path]:
     from navrep_data.models import checkpoint
 

@@ -225,12 +225,13 @@ def _card(path: Path, repo: str, license: str) -> str:
     else:
         facts = {"kind": kind, **described.get("config", {})}
     task = "reinforcement-learning" if kind in ("policy", "controller", "e2e") else "feature-extraction"
+    world_model = " world model" if kind in ("joint", "modular", "transformer") else ""
     lines = [
         "---", f"license: {license}", "library_name: navrep-data", f"pipeline_tag: {task}", "tags:",
         *(f"- {tag}" for tag in ("navrep", "robot-navigation", "lidar", "crowd")), "---", "",
         f"# {repo.split('/')[1]}", "",
-        f"A {kind} for robots that navigate among people, made with navrep-data: an independent re-implementation of "
-        "NavRep (Dugas et al. 2020), not made or endorsed by its authors.", "",
+        f"A {kind}{world_model} for robots that navigate among people, made with navrep-data: an independent "
+        "re-implementation of NavRep (Dugas et al. 2020), not made or endorsed by its authors.", "",
         "```python", "import navrep_data", "", f'model = navrep_data.zoo.load("hf://{repo}")', "```", "",
         "| setting | value |", "|---|---|",
         *(f"| {key} | `{json.dumps(value, ensure_ascii=False)}` |" for key, value in facts.items()), "",

@@ -135,3 +135,25 @@ def test_import_is_light_and_touches_nothing(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_help_texts_keep_their_brackets():
+    """Rich takes [m] and [ray] for markup and swallows them, unless they are escaped."""
+    from rich.text import Text
+    from typer.main import get_command
+
+    from navrep_data.cli.main import app
+
+    def verbs(command, name):
+        yield name, command
+        for below, one in getattr(command, "commands", {}).items():
+            yield from verbs(one, f"{name} {below}")
+
+    seen = 0
+    for name, command in verbs(get_command(app), "navrep-data"):
+        texts = [command.help or "", *(getattr(p, "help", None) or "" for p in command.params)]
+        for text in texts:
+            seen += 1
+            shown = Text.from_markup(text).plain
+            assert shown == text.replace("\\[", "["), f"{name}: {text!r} is shown as {shown!r}"
+    assert seen > 100

@@ -5,7 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from navrep_data.errors import ConfigError, DatasetMismatchError, DatasetNotFoundError, PolicyError, UnknownNameError
+from navrep_data.errors import (
+    ConfigError,
+    DatasetMismatchError,
+    DatasetNotFoundError,
+    ModelNotFoundError,
+    PolicyError,
+    UnknownNameError,
+)
 from navrep_data.evaluate import Results, benchmark, get_suite, redraw
 from navrep_data.evaluate.baselines import GoalPilot
 from navrep_data.evaluate.driver import write_report
@@ -15,6 +22,7 @@ from navrep_data.evaluate.policies import resolve_policy
 from navrep_data.evaluate.runner import TRAJECTORY_POINTS, n_worlds, thin, units
 from navrep_data.schema import Event
 from navrep_data.sim import Simulator, make_config
+from navrep_data.testing import tiny_checkpoint
 
 SUITE = get_suite("navreptest")
 
@@ -207,6 +215,7 @@ def test_variants_with_several_runs_get_a_line_of_their_own(tmp_path):
         ({"policies": ["goal"], "episodes": 0}, ConfigError, "episodes is 0"),
         ({"policies": ["goal"], "workers": 0}, ConfigError, "workers is 0"),
         ({"policies": ["goal"], "inference": "noisy"}, ConfigError, "expected one of: deterministic, as_released"),
+        ({"policies": ["./nowhere"]}, ModelNotFoundError, "There is no .*nowhere"),
         ({"policies": ["nowhere:function"]}, PolicyError, "cannot be imported.*or one of: goal, random, orca, dwa"),
         ({"policies": ["pilots_for_tests:wrong_shape"], "episodes": 1}, PolicyError, r"returned shape \(3, 2\)"),
         ({"policies": ["pilots_for_tests:not_a_number"], "episodes": 1}, PolicyError, "returned NaN"),
@@ -223,3 +232,28 @@ def test_a_callable_can_be_passed(tmp_path):
 
     report = benchmark([forward], episodes=2, out=tmp_path, figures=False)
     assert report.rows[0]["name"].endswith("forward")
+
+
+def test_a_policy_is_named_by_its_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    asked = {"suite": "navreptest", "episodes": 3, "figures": False}
+    tiny_checkpoint("models/mine", seed=3)
+    report = benchmark(["./models/mine/"], out="one", **asked)
+    assert (report.rows[0]["name"], report.rows[0]["episodes"]) == ("models/mine", 3)
+    first = paths(report)
+    assert set(first) == {0, 1, 2}
+    again = benchmark(["./models/mine"], out="one", **asked)
+    assert again.seconds["models/mine"] == 0.0  # nothing was played again
+    # other weights in the same place are other results
+    tiny_checkpoint("models/mine", seed=4)
+    with pytest.raises(DatasetMismatchError, match="policy_files"):
+        benchmark(["./models/mine"], out="one", **asked)
+    other = paths(benchmark(["models/mine"], out="two", **asked))
+    assert any(not np.array_equal(first[k], other[k]) for k in first)
+    tiny_checkpoint("models/v", model="vae")
+    with pytest.raises(PolicyError, match="holds a VAE, expected a policy"):
+        benchmark(["models/v"], out="one", **asked)
+
+
+def paths(report):
+    return Results.load(next(f for f in report.files if "mine" in f.name)).trajectories

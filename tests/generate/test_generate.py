@@ -27,6 +27,7 @@ from navrep_data.errors import (
     SchemaVersionError,
 )
 from navrep_data.generate import driver, executors, generate, plan
+from navrep_data.io import json_bytes
 from navrep_data.shards import DatasetFolder, Manifest, verify, writer_lock
 
 SMALL = {"humans": 4, "obstacles": 3, "length": 30, "shard_size": 2, "seed": 5}
@@ -277,6 +278,22 @@ def test_too_little_disk_is_said_before_anything_is_written(tmp_path, monkeypatc
     with pytest.raises(DiskSpaceError, match=r"0.00 GB free, about .* GB are needed for 2 sequences"):
         generate(n=2, out=tmp_path / "d", **SMALL)
     assert not (tmp_path / "d").exists()
+
+
+def test_a_manifest_too_large_to_be_read_is_said_before_anything_is_made(tmp_path, monkeypatch):
+    """At the default shard size a billion rows would end in one."""
+    monkeypatch.setattr(plan.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**14, 0, 10**14))
+    with pytest.raises(ConfigError, match=r"manifest larger than 256 MiB, the most that is read: give --shard-size 34"):
+        generate(n=1_000_000, out=tmp_path / "d")
+    with pytest.raises(ConfigError, match="make several datasets, or longer sequences"):
+        generate(n=10_000_000, out=tmp_path / "d")
+    assert not (tmp_path / "d").exists()
+
+
+def test_manifests_are_no_larger_than_planned(reference):
+    shards = json.loads((reference[0] / "manifest.json").read_text())["shards"]
+    per_shard = len(json_bytes({"shards": shards})) / 4
+    assert 0.5 < per_shard / (plan._MANIFEST_SHARD_BYTES + 2 * plan._MANIFEST_SEQUENCE_BYTES) < 1
 
 
 @pytest.mark.slow

@@ -10,16 +10,18 @@ import pytest
 import yaml
 from PIL import Image
 
-from navrep_data.datasets import cards
+from navrep_data.datasets import _hub_pictures, cards
 from navrep_data.datasets._hub_pictures import draw_pictures
-from navrep_data.errors import ConfigError
+from navrep_data.errors import ConfigError, MissingExtraError
 from navrep_data.io import json_bytes, sha256_file
 from navrep_data.shards import DatasetFolder, Manifest, dataset_card
+from navrep_data.sim.drawing import scan_points
+from navrep_data.sim.maps import load_map
 from navrep_data.testing import tiny_dataset
 
 FOLDER = Path(__file__).resolve().parents[2] / "cards" / "datasets"
 ENVS = sorted(cards.PUBLISHED)
-MAX_GIF_BYTES = 1_500_000
+MAX_PICTURE_BYTES = 300_000
 AGAIN = "run: python -m navrep_data.datasets.cards cards/datasets"
 
 
@@ -35,7 +37,10 @@ def test_cards_are_current():
         manifest = cards.read_published(FOLDER, env)
         assert committed[env] == dataset_card(manifest), AGAIN
         assert (FOLDER / f"{env}.json").read_bytes() == json_bytes(manifest.to_dict())
-        assert (manifest.env, manifest.license, manifest.complete) == (env, cards.PUBLISHED[env], True)
+        published = cards.PUBLISHED[env]
+        assert (manifest.env, manifest.license, manifest.complete) == (env, published.license, True)
+        assert manifest.command == published.command
+        assert manifest.card_sha256 == sha256_file(FOLDER / f"{env}.md")
 
 
 def test_pictures_are_those_of_the_manifests():
@@ -45,8 +50,11 @@ def test_pictures_are_those_of_the_manifests():
         listed |= {e.file: e.sha256 for e in extras if e.file.startswith("media/")}
     there = {f"media/{path.name}": sha256_file(path) for path in (FOLDER / "media").iterdir()}
     assert there == listed
-    for path in (FOLDER / "media").glob("*.gif"):
-        assert path.stat().st_size < MAX_GIF_BYTES
+    assert {Path(name).name for name in listed} == {
+        f"{env}-{kind}" for env in ENVS for kind in ("episode.gif", "scene.png")
+    }
+    for path in (FOLDER / "media").iterdir():
+        assert path.stat().st_size < MAX_PICTURE_BYTES
 
 
 @pytest.mark.parametrize("env", ENVS)
@@ -54,9 +62,9 @@ def test_card(env):
     manifest = cards.read_published(FOLDER, env)
     _, front, body = (FOLDER / f"{env}.md").read_text().split("---\n", 2)
     head = yaml.safe_load(front)
-    assert head["license"] == cards.PUBLISHED[env]
+    assert head["license"] == cards.PUBLISHED[env].license
     assert set(head["task_categories"]) <= {"reinforcement-learning", "robotics"}
-    assert head["size_categories"] == ["1M<n<10M"]
+    assert head["size_categories"] == ["1M<n<10M" if manifest.rows >= 1_000_000 else "100K<n<1M"]
     assert {"navrep", "lidar"} <= set(head["tags"])
     assert head["configs"] == [
         {"config_name": "default", "data_files": [{"split": "train", "path": "data/*.h5"}]}
@@ -70,6 +78,16 @@ def test_card(env):
         if extra.file.startswith("media/"):
             assert f"]({extra.file})" in body
     assert "not made or endorsed by the NavRep authors" in body
+
+
+@pytest.mark.parametrize("env", ENVS)
+def test_cards_of_maps_say_that_the_maps_have_no_licence(env):
+    card, config = (FOLDER / f"{env}.md").read_text(), cards.read_published(FOLDER, env).config
+    on_maps = config.get("world") == "map"
+    assert on_maps == (env == "ian")
+    assert ("`asl-pepper-2d-sim`, which states no licence" in card) == on_maps
+    assert ("humans that follow ORCA." in card) == ("\n- orca\n" in card) == (not on_maps)
+    assert cards.PUBLISHED[env].license == ("other" if on_maps else "mit")  # nobody may licence others' maps
 
 
 @pytest.mark.slow
@@ -95,6 +113,7 @@ def test_the_package_generates_what_the_card_describes(env, tmp_path):
 
 @pytest.mark.slow
 def test_add_takes_over_a_dataset(simulated, tmp_path, monkeypatch):
+    monkeypatch.setattr(cards, "PUBLISHED", {"soadrl": cards.PUBLISHED["soadrl"]})
     cards.add(tmp_path, simulated)
     assert cards.write_cards(tmp_path) == [tmp_path / "soadrl.md"]
     assert "license: mit" in (tmp_path / "soadrl.md").read_text()
@@ -102,6 +121,20 @@ def test_add_takes_over_a_dataset(simulated, tmp_path, monkeypatch):
     monkeypatch.setattr(cards, "PUBLISHED", {})
     with pytest.raises(ConfigError, match="a dataset of soadrl, which is not in PUBLISHED: add its line"):
         cards.add(tmp_path, simulated)
+
+
+@pytest.mark.slow
+def test_one_command_makes_dataset_and_card(tmp_path, monkeypatch, capfd):
+    line = cards.Published("navrep-data generate --env empty --n 2 --length 60", "mit")
+    monkeypatch.setattr(cards, "PUBLISHED", {"empty": line})
+    found = []
+    for _ in range(2):
+        cards.main([str(tmp_path / "cards"), "--data", str(tmp_path / "data")])
+        found.append({p.relative_to(tmp_path): sha256_file(p) for p in tmp_path.rglob("*") if p.is_file()})
+    assert found[0] == found[1]  # what is there is not made anew
+    assert Manifest.read(tmp_path / "data" / "empty").rows == 120
+    assert "navrep-data generate --env empty --n 2" in (tmp_path / "cards" / "empty.md").read_text()
+    assert str(tmp_path / "cards" / "empty.md") in capfd.readouterr().out
 
 
 # ---- pictures ----
@@ -112,7 +145,7 @@ def test_pictures_are_drawn_from_the_data(simulated):
     with DatasetFolder(simulated) as folder:
         made = draw_pictures(folder)
     gif, png = (Image.open(io.BytesIO(made[f"media/soadrl-{name}"])) for name in ("episode.gif", "scene.png"))
-    assert len(made["media/soadrl-episode.gif"]) < MAX_GIF_BYTES
+    assert len(made["media/soadrl-episode.gif"]) < MAX_PICTURE_BYTES
     assert png.size == (1100, 600)
     assert 10 <= gif.n_frames <= 48
     assert gif.info["loop"] == 0
@@ -123,6 +156,39 @@ def test_pictures_are_drawn_from_the_data(simulated):
     for colour in ((209, 73, 91), (46, 134, 171)):  # the robot's red, somebody's blue
         distance = np.abs(np.asarray(png.convert("RGB")).astype(int) - colour).sum(axis=2)
         assert (distance < 30).any()
+
+
+@pytest.mark.slow
+def test_pictures_on_maps_show_what_the_lidar_saw(tmp_path):
+    """The data do not hold the map; walls are where rays ended, and nobody's legs are among them."""
+    from navrep_data.generate import generate
+
+    try:
+        load_map("asl")
+    except MissingExtraError as missing:
+        pytest.skip(str(missing))
+    generate(env="ian", n=1, length=60, out=tmp_path / "ian", workers=1)
+    with DatasetFolder(tmp_path / "ian") as folder:
+        episode = _hub_pictures._choose(folder)
+        made = draw_pictures(folder)
+        assert episode is not None
+        grid = load_map(episode.world.map)
+        cells = grid.cell_of(episode.walls)
+        inside = grid.contains(episode.walls)
+        assert inside.mean() > 0.95
+        near = grid.distance[tuple(cells[inside].T)]
+        assert (near < 0.3).mean() > 0.95
+        pose = episode.rows["robot_pose"][0]
+        ends = scan_points(episode.metres(0), pose, folder.manifest.sensor)
+        human = _hub_pictures._to_world(episode.rows["humans"][0], pose)[0]
+        ends[5] = human[:2] + 0.2  # somebody's leg
+        left = episode._fixed(ends, 0)
+        assert 500 < len(left) < len(ends)
+        assert (np.hypot(*(left - human[:2]).T) > human[4]).all()
+    assert set(made) == {"media/ian-episode.gif", "media/ian-scene.png"}
+    assert all(len(data) < MAX_PICTURE_BYTES for data in made.values())
+    png = np.asarray(Image.open(io.BytesIO(made["media/ian-scene.png"])).convert("RGB")).astype(int)
+    assert (np.abs(png - (0x5B, 0x64, 0x70)).sum(axis=2) < 30).sum() > 200  # walls
 
 
 def test_no_pictures_without_worlds_or_humans(simulated, monkeypatch):

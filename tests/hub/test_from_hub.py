@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 
 from navrep_data.datasets import ScanDataset, SequenceDataset, StreamingSequenceDataset, push
 from navrep_data.datasets._hub_store import ShardStore
-from navrep_data.errors import ConfigError, CorruptDataError, HubError, OfflineError
+from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, HubError, OfflineError
 from navrep_data.shards import Manifest, content_hash
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -99,6 +99,41 @@ def test_a_wrong_shard_never_opens(hub, pushed):
         SequenceDataset.from_hub(REPO, "1d", window=8)
     hub.faults = []
     assert len(SequenceDataset.from_hub(REPO, "1d", window=8))
+
+
+@pytest.mark.parametrize("revision", few([None, "v1"], 1))
+def test_a_revision_is_what_it_was(hub, pushed, template, revision):
+    """A branch that moves changes nothing for who pinned a commit, or has opened the dataset."""
+    hub.repo(REPO).branches["v1"] = pushed.commit
+    stream = StreamingSequenceDataset.from_hub(REPO, "1d", revision=revision, window=8, shuffle=False)
+    hub.repo(REPO).branches["v1"] = hub.repo(REPO).commit("main", {"README.md": b"gone"})
+    here = SequenceDataset(template, "1d", window=8)
+    assert len(list(stream)) == len(here)
+    same(SequenceDataset.from_hub(REPO, "1d", revision=pushed.commit, window=8), here)
+    with pytest.raises(DatasetNotFoundError, match=r"has no manifest.json"):
+        SequenceDataset.from_hub(REPO, "1d", revision=revision, window=8)
+
+
+@pytest.mark.parametrize("cls", few([StreamingSequenceDataset, SequenceDataset], 1))
+@pytest.mark.parametrize(
+    "fault",
+    few(
+        [
+            Fault("cut", SHARD, "GET", times=4, at=5000),
+            Fault("flip", SHARD, "GET", times=1),
+            Fault("status", SHARD, "GET", times=2, status=429, headers={"Retry-After": "3"}),
+            Fault("stall", SHARD, "GET", times=1, seconds=5),
+        ],
+        1,
+    ),
+    ids=lambda f: f.kind,
+)
+def test_opening_goes_on_after_a_failure(hub, pushed, template, cls, fault):
+    hub.faults = [Fault(**fault.__dict__)]
+    options = {"window": 8, "fields": ["sequence", "step"]}
+    there = cls.from_hub(REPO, "1d", **options)
+    assert windows(there) == windows(SequenceDataset(template, "1d", **options))
+    assert hub.faults[0].times == 0
 
 
 # ---- streaming ----

@@ -155,6 +155,7 @@ def test_a_world_model_goes_up_and_comes_down(hub, template, tmp_path):
     assert files["model.safetensors"] == (tmp_path / "m" / "model.safetensors").read_bytes()
     card = files["README.md"].decode()
     assert card.startswith("---\nlicense: mit\nlibrary_name: navrep-data\n")
+    assert "A joint world model for robots" in card
     assert record["content_hash"] in card
     assert record["revision"] in card
     same_weights(zoo.load(f"hf://{REPO}"), module)

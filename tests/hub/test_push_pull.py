@@ -430,6 +430,30 @@ def test_refusals_are_one_line(hub, pushed, tmp_path, status, words):
     assert hub.count("") == 1
 
 
+@pytest.mark.parametrize(
+    ("path", "status", "code", "words"),
+    few(
+        [
+            (r"/resolve/.*/shard-00001.h5", 404, "EntryNotFound", "it lacks a file; check that navrep-data wrote it"),
+            (LARGE, 403, "", "the token may not do that"),  # as links that have expired do
+            (r"/resolve/.*/shard-00001.h5", 401, "", "it is private or not there, or the token is not accepted"),
+            (r"/resolve/.*/shard-00001.h5", 401, "GatedRepo", "it is gated: ask for access on its page"),
+            (LARGE, 404, "", "the Hub answers 404"),
+            (r"/tree/", 404, "RevisionNotFound", "there is no such revision"),
+        ],
+        2,
+    ),
+)
+def test_refusals_on_the_way_are_one_line(hub, pushed, template, tmp_path, path, status, code, words):
+    hub.faults = [Fault("status", path, times=1000, status=status, headers={"X-Error-Code": code})]
+    with pytest.raises(HubError, match=words) as caught:
+        pull(REPO, tmp_path / "got")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "got" / "manifest.json").exists()
+    hub.faults = []
+    check_whole(pull(REPO, tmp_path / "got").root, template)
+
+
 def test_a_wrong_token(hub, pushed, template, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_TOKEN", "hf_wrong")
     with pytest.raises(HubError, match=r"or the token is not accepted; log in with `hf auth login`, or set HF_TOKEN"):
@@ -657,6 +681,22 @@ def test_cli(command, hub, template, tmp_path):
     code, out, err = command("pull", "user/none")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "there is no such repository, or it is private" in err
+
+
+@pytest.mark.slow
+def test_cli_of_models(command, hub, tmp_path):
+    from navrep_data.models import checkpoint
+
+    checkpoint.save(checkpoint.make("controller", {}), tmp_path / "m")
+    code, out, err = command("push-model", "m", "user/brain")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("Error: m has no licence, expected one to publish it under: --license mit")
+    code, out, err = command("push-model", "m", "user/brain", "--license", "mit", "--private", "--revision", "v2")
+    assert (code, err) == (0, "")
+    repo = hub.repo("user/brain", "model")
+    assert repo.private
+    assert f'next: navrep_data.zoo.load("hf://user/brain@{repo.branches["v2"]}")' in out
+    assert repo.files("v2")["model.safetensors"] == (tmp_path / "m" / "model.safetensors").read_bytes()
 
 
 def wait_for(condition, seconds=60):

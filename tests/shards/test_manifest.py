@@ -275,6 +275,10 @@ def test_card_says_who_walked_and_how_the_lidar_saw(dataset):
     assert "a planar lidar without noise, humans that follow ORCA." in plain
     other = dataset_card(replace(manifest, config={"human_policy": "static", "scan_noise": 0.1}))
     assert "a planar lidar with noise, humans that stand still." in other
+    assert "\n- orca\n" in plain
+    assert "\n- orca\n" not in other
+    assert "`worlds/` holds the obstacles, goals" in other
+    assert "`worlds/` holds the map, goals" in dataset_card(replace(manifest, config={"world": "map"}))
 
 
 def test_card_of_a_dataset_without_optional_parts(tmp_path):
