@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
 import math
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +39,7 @@ MAX_RAYS = 100_000
 SAME_GOAL = 1e-3
 _LISTED = 12
 
+_PlainPath: Any = type(Path())
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
@@ -79,6 +82,25 @@ class Tracks:
     twist: Floats
     goal_times: Ints
     goals: Floats
+
+
+class _SizedFile(io.BufferedReader):
+    """A file that is never asked for more bytes than are left: memory is set aside for whatever a header claims."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._size = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        left = max(self._size - self.tell(), 0)
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
+class _BagPath(_PlainPath):  # type: ignore[misc]
+    """A path that opens such files; rosbags takes any path that has the methods of one."""
+
+    def open(self, mode: str = "r", *arguments: Any, **named: Any) -> Any:
+        return _SizedFile(self) if mode == "rb" else super().open(mode, *arguments, **named)
 
 
 class Bag:
@@ -129,7 +151,7 @@ class Bag:
         with self._explained():
             # bags of older ROS 2 do not say what their messages look like; those used here never changed
             store = types.get_typestore(types.Stores.ROS2_HUMBLE)
-            return self._stack.enter_context(highlevel.AnyReader([self.path], default_typestore=store))
+            return self._stack.enter_context(highlevel.AnyReader([_BagPath(self.path)], default_typestore=store))
 
     @contextlib.contextmanager
     def _explained(self) -> Iterator[None]:

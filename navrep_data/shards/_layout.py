@@ -104,10 +104,10 @@ def column_order(names: Iterable[str]) -> tuple[str, ...]:
     for name in given:
         if name not in COLUMNS:
             raise ConfigError(
-                f"Unknown column {name!r}; expected some of {', '.join(COLUMNS)}.{did_you_mean(name, COLUMNS)}"
+                f"Unknown column {name[:60]!r}; expected some of {', '.join(COLUMNS)}.{did_you_mean(name, COLUMNS)}"
             )
-    if len(set(given)) != len(given):
-        raise ConfigError(f"Columns {given} hold a name twice; expected each once.")
+        if given.count(name) > 1:
+            raise ConfigError(f"Column {name!r} is named twice; expected each once.")
     missing = [name for name, column in COLUMNS.items() if not column.optional and name not in given]
     if missing:
         raise ConfigError(f"Column {missing[0]!r} is missing; every dataset has it. Add it to the columns.")

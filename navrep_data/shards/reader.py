@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from navrep_data.errors import CorruptDataError, DatasetNotFoundError, SchemaVersionError
 from navrep_data.schema import COLUMNS, FORMAT_NAME, FORMAT_VERSION, SensorContract
+from navrep_data.shards._attributes import read_attribute
 from navrep_data.shards._codec import inflate, unshuffle
 from navrep_data.shards._layout import Layout, layouts
 from navrep_data.shards.entries import ShardEntry
@@ -227,23 +228,22 @@ class Shard:
 
     def _open(self, file: Any) -> None:
         """Check the open file and remember where its chunks are."""
-        attributes = file.attrs
-        if str(attributes.get("format", "")) != FORMAT_NAME:
+        if self._attribute(file, "format") != FORMAT_NAME:
             raise self._corrupt(f"is HDF5, but its attribute 'format' is not {FORMAT_NAME!r}")
-        version = self._number(attributes, "format_version")
+        version = self._number(file, "format_version")
         if version > FORMAT_VERSION:
             raise SchemaVersionError(
                 f"{self.path} has format version {version:g}; "
                 f"this package reads versions 1 to {FORMAT_VERSION}. Upgrade it: pip install -U navrep-data"
             )
-        self.env = str(attributes.get("env", ""))
-        self.rows = int(self._number(attributes, "rows"))
-        self.length = int(self._number(attributes, "length"))
-        first_stop = attributes.get("sequences")
+        self.env = str(self._attribute(file, "env") or "")
+        self.rows = int(self._number(file, "rows"))
+        self.length = int(self._number(file, "length"))
+        first_stop = self._attribute(file, "sequences")
         if not isinstance(first_stop, np.ndarray) or first_stop.shape != (2,) or first_stop.dtype.kind != "i":
             raise self._corrupt("has no attribute 'sequences' of two whole numbers")
         self.sequences = (int(first_stop[0]), int(first_stop[1]))
-        numbers = {name: self._number(attributes, name) for name in SensorContract().to_dict()}
+        numbers = {name: self._number(file, name) for name in SensorContract().to_dict()}
         self.sensor = SensorContract(n_rays=int(numbers.pop("n_rays")), **numbers)
         if file.userblock_size:  # moves all offsets
             raise self._corrupt(f"starts with a user block of {file.userblock_size} bytes; expected plain HDF5")
@@ -255,8 +255,14 @@ class Shard:
             if chunked is not None:
                 self._chunked[name] = chunked
 
-    def _number(self, attributes: Any, name: str) -> float:
-        value = attributes.get(name)
+    def _attribute(self, file: Any, name: str) -> Any:
+        try:
+            return read_attribute(file, name)
+        except ValueError as error:
+            raise self._corrupt(f"is HDF5, but its {error}") from error
+
+    def _number(self, file: Any, name: str) -> float:
+        value = self._attribute(file, name)
         if not isinstance(value, np.number) or not np.isfinite(value) or value.dtype.kind not in "iuf":
             raise self._corrupt(f"has no number as attribute {name!r}")
         result: float = value.item()

@@ -11,8 +11,7 @@ import h5py
 
 from navrep_data.errors import CorruptDataError
 from navrep_data.schema import FORMAT_NAME
-
-MAX_CONFIG_BYTES = 1 << 20
+from navrep_data.shards._attributes import read_attribute
 
 
 @dataclass(frozen=True)
@@ -52,12 +51,10 @@ def read_recipe(path: Path | str) -> ShardRecipe:
     """
     try:
         with h5py.File(path, "r") as file:
-            values = file.attrs
-            if values["format"] != FORMAT_NAME or len(values["config"]) > MAX_CONFIG_BYTES:
-                raise ValueError("its attributes are not those of a shard")
-            return ShardRecipe(
-                str(values["env"]), json.loads(values["config"]), int(values["seed"]), int(values["length"])
-            )
+            values = {name: read_attribute(file, name) for name in ("format", "env", "config", "seed", "length")}
+        if values["format"] != FORMAT_NAME:
+            raise ValueError("its attributes are not those of a shard")
+        return ShardRecipe(str(values["env"]), json.loads(values["config"]), int(values["seed"]), int(values["length"]))
     except Exception as error:  # a damaged file makes the HDF5 library raise nearly anything
         text = " ".join(str(error).split())[:200]
         raise CorruptDataError(f"{path} cannot be read as a shard ({text}); get it again or make it again.") from error

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from navrep_data.errors import ConfigError, CorruptDataError
 from navrep_data.io import atomic_write_bytes, sha256_bytes, translate_os_error
 from navrep_data.schema import COLUMNS, EVENT_NAMES, FORMAT_NAME, FORMAT_VERSION, Event, SensorContract
+from navrep_data.shards._attributes import write_attribute
 from navrep_data.shards._codec import DEFLATE_LEVEL, encode
 from navrep_data.shards._layout import Layout, column_attributes, layouts, little_endian
 from navrep_data.shards.entries import FileEntry, ShardEntry, shard_file, worlds_file
@@ -305,7 +306,7 @@ class ShardWriter:
         room = sum(len(c) + 64 for chunks in self._chunks.values() for c in chunks) + _HEADER_ROOM
         with h5py.File("shard", "w", driver="core", backing_store=False, block_size=room, libver=_LIBVER) as file:
             for name, value in self._attributes().items():
-                file.attrs[name] = value
+                write_attribute(file, name, value)
             for name, layout in self.layouts.items():
                 self._write_column(file, name, layout)
             file.flush()

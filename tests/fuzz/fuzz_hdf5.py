@@ -15,6 +15,8 @@ ATTRIBUTES: tuple[Any, ...] = (
     np.zeros(0),
     np.array([0, 2**62]), np.array([2, 1]), np.array(["a", "b"], "S1"), True, np.complex64(1), np.float16(2),
     np.array([[1, 2]]), h5py.Empty("f4"), np.uint64(2**64 - 1),
+    *map(np.bytes_, (b"navrep-data", b"x" * 5000, b"{}", b"[" * 3000, b'{"a": NaN}', b"\xff", b"soadrl\n", b"")),
+    np.zeros(1 << 18, "f8"), np.bytes_(b"[" * (2 << 20)),
 )  # fmt: skip
 _VALUES = (
     0,

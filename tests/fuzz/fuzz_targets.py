@@ -1,7 +1,7 @@
 """Everything that reads files from outside, each with a valid file made by this package to start from.
 
 A reader that is new gets an entry in :data:`TARGETS`: a function that makes valid files in a folder, and one that reads
-them there as deeply as users do. Bags are added here together with ``import-rosbag``.
+them there as deeply as users do.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import shutil
+import sys
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -140,11 +141,13 @@ def _fit_rows(shard: dict[str, Any], data: bytes, values: dict[str, Any]) -> Non
     """Let the manifest say of rows and lengths what the shard says."""
     import h5py
 
+    from navrep_data.shards._attributes import read_attribute
+
     with contextlib.suppress(Exception), h5py.File(io.BytesIO(data), "r") as file:
-        rows = int(file.attrs["rows"])
+        rows = int(read_attribute(file, "rows"))
         if rows != shard["rows"]:
             values["rows"] = shard["rows"] = rows
-            values["length"] = max(values["length"], int(file.attrs["length"]), rows)
+            values["length"] = max(values["length"], int(read_attribute(file, "length")), rows)
 
 
 def _read_shard(folder: Path) -> None:
@@ -279,6 +282,23 @@ def _read_npz(folder: Path) -> None:
 
     shutil.rmtree(folder / "out", ignore_errors=True)
     import_npz(folder, folder / "out", rings=False)
+
+
+def _make_bag(kind: str) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        sys.path.insert(0, str(Path(__file__).parents[1] / "datasets"))
+        from bag_files import record
+
+        record(folder / "bag", kind, seconds=0.8)
+
+    return make
+
+
+def _read_bag(folder: Path) -> None:
+    from navrep_data.datasets import import_rosbag
+
+    with tempfile.TemporaryDirectory() as out:  # some changes leave no bag, nor a folder
+        import_rosbag(next(folder.iterdir(), folder / "bag"), Path(out) / "d", dt=0.2, rings=False)
 
 
 # --- models -----------------------------------------------------------------------------------------------------
@@ -546,6 +566,9 @@ TARGETS: tuple[Target, ...] = (
     Target("dataset", _make_dataset, _read_dataset, _seal_dataset),
     Target("index", _make_index, _read_index, _seal_manifest),
     Target("npz", _make_npz, _read_npz),
+    Target("bag-ros1", _make_bag("ros1"), _read_bag),
+    Target("bag-ros2", _make_bag("ros2"), _read_bag),
+    Target("bag-mcap", _make_bag("mcap"), _read_bag),
     Target("map", _make_map, _read_map),
     Target("results", _make_results, _read_results),
     Target("sb2-zip", _make_sb2, _read_any),

@@ -98,6 +98,15 @@ def test_statistics_that_are_no_table(files, name, key, value):
     refused(lambda: target.read(files), CorruptDataError, "statistics' holds something else than numbers")
 
 
+@of("manifest")
+@pytest.mark.parametrize("columns", [["a" * 100_000], ["scan"] * 10_000])
+def test_column_names_without_end(files, columns):
+    """Found by fuzzing: the refusal repeated them whole."""
+    values = json.loads((files / "manifest.json").read_bytes())
+    (files / "manifest.json").write_text(json.dumps({**values, "columns": columns}))
+    refused(lambda: BY_NAME["manifest"].read(files), CorruptDataError, "field 'columns'")
+
+
 @of("results")
 @pytest.mark.parametrize(
     "change",
@@ -400,6 +409,51 @@ def test_attributes_that_are_no_numbers(shard, value):
     refused(lambda: read_recipe(shard), CorruptDataError, "cannot be read as a shard")
 
 
+def endless_heap(path):
+    """Let the free space of every global heap be 0 bytes long: the library looks for what follows it for ever."""
+    data = bytearray(path.read_bytes())
+    heap = data.find(b"GCOL")
+    assert heap >= 0
+    while heap >= 0:
+        item = heap + 16
+        while int.from_bytes(data[item : item + 2], "little"):
+            size = int.from_bytes(data[item + 8 : item + 16], "little")
+            item += 16 + -(-size // 8) * 8
+        data[item + 8 : item + 16] = bytes(8)
+        heap = data.find(b"GCOL", heap + 1)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("name", ["format", "env", "config"])
+def test_text_whose_heap_has_no_end(shard, name):
+    """Found by fuzzing: HDF5 itself hung on reading the attribute."""
+    with h5py.File(shard, "r+") as file:
+        file.attrs[name] = file.attrs[name].decode()
+    endless_heap(shard)
+    refused(lambda: read_recipe(shard), CorruptDataError, f"attribute '{name}' is text of variable length")
+    if name != "config":  # which is not needed to read rows
+        refused(lambda: Shard(shard), CorruptDataError, f"attribute '{name}' is text of variable length")
+
+
+def test_a_shard_needs_nothing_from_a_heap(shard):
+    expected = Shard(shard).read("scan", 0, 8)
+    endless_heap(shard)  # of the columns' attributes
+    assert read_recipe(shard).env == "soadrl"
+    assert np.array_equal(Shard(shard).read("scan", 0, 8), expected)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [h5py.Empty("S3"), np.array([b"navrep-data"]), np.bytes_(b"\xff"), np.bytes_(b"x" * (2 << 20)), np.complex64(1),
+     np.array([(1,)], [("a", "i4")]), True, 1],
+)  # fmt: skip
+def test_attributes_that_are_no_text(shard, value):
+    with h5py.File(shard, "r+") as file:
+        file.attrs["format"] = value
+    refused(lambda: read_recipe(shard), CorruptDataError, "cannot be read as a shard")
+    refused(lambda: Shard(shard), CorruptDataError, "attribute 'format'")
+
+
 @of("latents")
 def test_codes_that_are_not_there(files):
     (path,) = files.glob("**/*.h5")
@@ -411,6 +465,23 @@ def test_codes_that_are_not_there(files):
     for name, data in target.seal(load_files(files)).items():
         (files / name).write_bytes(data)
     refused(lambda: target.read(files), CorruptDataError, "not stored in one piece")
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "at", "size", "words"),
+    [("bag-ros1", "bag.bag", 13, 2**32 - 1, "Header could not be read"),
+     ("bag-mcap", "bag/bag.mcap", 9, 2**40, "Truncated record")],
+)  # fmt: skip
+def test_bags_that_claim_more_bytes_than_they_have(tmp_path, name, file, at, size, words):
+    """Found by fuzzing: the first record's length was set aside in memory before anything was read."""
+    pytest.importorskip("rosbags")
+    target = BY_NAME[name]
+    target.make(tmp_path)
+    data = bytearray((tmp_path / file).read_bytes())
+    width = 4 if name == "bag-ros1" else 8
+    data[at : at + width] = size.to_bytes(width, "little")
+    (tmp_path / file).write_bytes(data)
+    refused(lambda: target.read(tmp_path), CorruptDataError, words)
 
 
 def test_one_sequence_of_more_rows_than_fit_into_memory(tmp_path, monkeypatch):

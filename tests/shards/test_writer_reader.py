@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import pickle
@@ -117,7 +118,8 @@ def test_sequence_hash_ignores_rings_chunks_and_nan_payloads():
 def test_attributes_serve_plain_h5py(tmp_path):
     write(tmp_path / "s.h5", [50], 100)
     with h5py.File(tmp_path / "s.h5") as file:
-        assert file.attrs["format"] == "navrep-data"
+        assert file.attrs["format"] == b"navrep-data"
+        assert json.loads(file.attrs["config"])["name"] == "\u00e9t\u00e9"
         assert file["scan"].attrs["units"] == "mm"
         assert file["scan"].attrs["scale"] == 0.001
         assert file["event"].attrs["names"].split(",")[1] == "goal"
