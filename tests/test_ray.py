@@ -40,6 +40,8 @@ PATIENT = "pilots_for_tests:patient"
 DATA = {"n": 24, "length": 40, "humans": 4, "obstacles": 3, "shard_size": 2, "seed": 5, "policy": PATIENT}
 DATA["policy_batch"] = 2
 
+# a cluster that hangs must not take the whole suite's time
+pytestmark = pytest.mark.timeout(240)
 slow = pytest.mark.slow
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs navrep-data[ray]")
 needs_proc = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc to find worker processes")
@@ -259,7 +261,7 @@ def test_a_cluster_of_its_own_ends_with_the_run(tmp_path):
     env = {k: v for k, v in os.environ.items() if k != "RAY_ADDRESS"}
     done = subprocess.run(
         [sys.executable, "-m", "navrep_data", *words.split()], cwd=tmp_path, env=env, capture_output=True, text=True,
-        timeout=240,
+        timeout=200,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "3 sequences, 90 rows, 3 shards" in done.stdout
@@ -273,7 +275,7 @@ def test_from_the_command_line(nodes, tmp_path):
     nodes.fill()
     words = f"generate --n 3 --length 30 --humans 4 --obstacles 3 --executor ray --address {nodes.address} --out d"
     done = subprocess.run(
-        [sys.executable, "-m", "navrep_data", *words.split()], cwd=tmp_path, capture_output=True, text=True, timeout=240
+        [sys.executable, "-m", "navrep_data", *words.split()], cwd=tmp_path, capture_output=True, text=True, timeout=200
     )
     assert done.returncode == 0, done.stderr
     generate(n=3, length=30, humans=4, obstacles=3, out=tmp_path / "here")
