@@ -231,7 +231,8 @@ def load(path: Path | str) -> nn.Module:
     try:
         state = safetensors.torch.load(data)
     except safetensors.SafetensorError as error:
-        raise CheckpointError(f"{weights_path} is not a safetensors file ({error}); get it again.") from error
+        said = " ".join(str(error).split())[:160]  # it may repeat what it read
+        raise CheckpointError(f"{weights_path} is not a safetensors file ({said}); get it again.") from error
     for name, value in state.items():
         if value.dtype != STORAGE[storage]:
             raise CheckpointError(f"{weights_path}: {name[:80]!r} is {value.dtype}, expected {storage}; get it again.")

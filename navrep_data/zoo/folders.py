@@ -115,8 +115,9 @@ def read_policy(folder: Path | str) -> dict[str, Any]:
             "newer navrep-data."
         )
     check_described(found, path, {"parts": ([CONTROLLER], [CONTROLLER, "world_model"], [CONTROLLER, "vae"])})
-    if not isinstance(found.get("name"), str) or not isinstance(found.get("metadata"), dict):
-        raise CheckpointError(f"{path}: name or metadata are missing; get the policy again.")
+    missing = [name for name in ("features", "lidar", "context") if name not in found]  # null is a value of theirs
+    if missing or not isinstance(found.get("name"), str) or not isinstance(found.get("metadata"), dict):
+        raise CheckpointError(f"{path}: {(missing or ['name or metadata'])[0]} is missing; get the policy again.")
     return found
 
 
