@@ -185,7 +185,7 @@ def read_config(path: Path | str) -> dict[str, Any]:
         raise CheckpointError(f"{config_path} is not the config of a navrep-data model (no format {FORMAT_NAME!r}).")
     if found.get("format_version") != FORMAT_VERSION:
         raise CheckpointError(
-            f"{config_path} has format version {str(found.get('format_version'))[:20]}, expected {FORMAT_VERSION}: "
+            f"{config_path} has format version {repr(found.get('format_version'))[:20]}, expected {FORMAT_VERSION}: "
             "install a newer navrep-data."
         )
     return found

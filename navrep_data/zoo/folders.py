@@ -111,7 +111,7 @@ def read_policy(folder: Path | str) -> dict[str, Any]:
         raise CheckpointError(f"{path} is not the description of a policy (no format {POLICY_FORMAT!r}).")
     if found.get("format_version") != POLICY_VERSION:
         raise CheckpointError(
-            f"{path} has format version {str(found.get('format_version'))[:20]}, expected {POLICY_VERSION}: install a "
+            f"{path} has format version {repr(found.get('format_version'))[:20]}, expected {POLICY_VERSION}: install a "
             "newer navrep-data."
         )
     check_described(found, path, {"parts": ([CONTROLLER], [CONTROLLER, "world_model"], [CONTROLLER, "vae"])})

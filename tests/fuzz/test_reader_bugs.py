@@ -165,6 +165,19 @@ def test_headers_of_safetensors_that_are_one_long_word(tmp_path, name):
     refused(lambda: target.read(tmp_path), CheckpointError, "is not a safetensors file")
 
 
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [("checkpoint", "config.json"), ("policy", "saved/policy.json"), ("latents", "manifest.json")],
+)
+def test_versions_of_several_lines(tmp_path, name, file):
+    """Found by fuzzing: the refusal showed them as they are."""
+    target = BY_NAME[name]
+    target.make(tmp_path)
+    values = json.loads((tmp_path / file).read_bytes())
+    (tmp_path / file).write_text(json.dumps({**values, "format_version": "1\n\n"}))
+    refused(lambda: target.read(tmp_path), NavrepDataError, "has format version '1")
+
+
 @of("policy")
 @pytest.mark.parametrize("key", ["features", "lidar", "context"])
 def test_a_policy_that_does_not_say_what_it_sees(files, key):
