@@ -134,7 +134,7 @@ class LatentManifest:
             )
         if found.get("format_version") != FORMAT_VERSION:
             raise SchemaVersionError(
-                f"{path} has format version {str(found.get('format_version'))[:20]}, this package reads "
+                f"{path} has format version {repr(found.get('format_version'))[:20]}, this package reads "
                 f"{FORMAT_VERSION}. Upgrade it: pip install -U navrep-data"
             )
         hashed = {name: value for name, value in found.items() if name != "manifest_sha256"}
@@ -152,7 +152,7 @@ class LatentManifest:
     def _parse(cls, found: dict[str, Any], root: Path) -> LatentManifest:
         z_size = found["z_size"]
         if type(z_size) is not int or not 1 <= z_size <= _MAX_Z:
-            raise ValueError(f"z_size {str(z_size)[:20]}")
+            raise ValueError(f"z_size {repr(z_size)[:20]}")
         shards = []
         for entry in found["shards"]:
             first, stop = (int(n) for n in entry["sequences"])
@@ -334,7 +334,7 @@ class LatentDataset(Dataset[Batch]):
         index = np.asarray(indices, np.int64)
         n = len(self.table)
         if index.ndim != 1 or len(index) == 0 or index.min() < -n or index.max() >= n:
-            raise IndexError(f"indices {str(index)[:60]} do not fit {n} windows.")
+            raise IndexError(f"indices {repr(index)[:60]} do not fit {n} windows.")
         chosen, table = np.mod(index, n), self.table
         return self._assemble(self._rows, table.start[chosen], table.count[chosen], table.after[chosen])
 

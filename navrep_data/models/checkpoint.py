@@ -185,7 +185,7 @@ def read_config(path: Path | str) -> dict[str, Any]:
         raise CheckpointError(f"{config_path} is not the config of a navrep-data model (no format {FORMAT_NAME!r}).")
     if found.get("format_version") != FORMAT_VERSION:
         raise CheckpointError(
-            f"{config_path} has format version {str(found.get('format_version'))[:20]}, expected {FORMAT_VERSION}: "
+            f"{config_path} has format version {repr(found.get('format_version'))[:20]}, expected {FORMAT_VERSION}: "
             "install a newer navrep-data."
         )
     return found
@@ -231,7 +231,8 @@ def load(path: Path | str) -> nn.Module:
     try:
         state = safetensors.torch.load(data)
     except safetensors.SafetensorError as error:
-        raise CheckpointError(f"{weights_path} is not a safetensors file ({error}); get it again.") from error
+        said = " ".join(str(error).split())[:160]  # it may repeat what it read
+        raise CheckpointError(f"{weights_path} is not a safetensors file ({said}); get it again.") from error
     for name, value in state.items():
         if value.dtype != STORAGE[storage]:
             raise CheckpointError(f"{weights_path}: {name[:80]!r} is {value.dtype}, expected {storage}; get it again.")

@@ -35,7 +35,7 @@ class ModelConfig:
             limit = _LARGEST_OF.get(field.name, _LARGEST)
             if field.type == "int" and (type(value) is not int or not 1 <= value <= limit):
                 raise ConfigError(
-                    f"{field.name} of a {self.kind} is {str(value)[:40]}, expected a whole number from 1 to {limit}."
+                    f"{field.name} of a {self.kind} is {repr(value)[:40]}, expected a whole number from 1 to {limit}."
                 )
             if field.type == "bool" and type(value) is not bool:
                 raise ConfigError(f"{field.name} of a {self.kind} is {str(value)[:40]!r}, expected true or false.")
@@ -252,4 +252,4 @@ def _check_bounds(kind: str, squash: str, max_speed: float) -> None:
     if squash not in SQUASHES:
         raise ConfigError(f"squash of a {kind} is {str(squash)[:40]!r}, expected one of: {', '.join(SQUASHES)}.")
     if isinstance(max_speed, bool) or not isinstance(max_speed, int | float) or not 0.0 <= max_speed <= 10.0:
-        raise ConfigError(f"max_speed of a {kind} is {str(max_speed)[:40]}, expected 0 (no limit) to 10 m/s.")
+        raise ConfigError(f"max_speed of a {kind} is {repr(max_speed)[:40]}, expected 0 (no limit) to 10 m/s.")

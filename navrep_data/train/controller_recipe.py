@@ -95,9 +95,9 @@ class ControllerRecipe:
         for field in dataclasses.fields(self):
             value: Any = getattr(self, field.name)
             if field.type == "int" and (type(value) is not int or value < (0 if field.name == "seed" else 1)):
-                raise ConfigError(f"{field.name} is {str(value)[:40]}, expected a whole number of at least 1.")
+                raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected a whole number of at least 1.")
             if field.type == "float" and (type(value) not in (int, float) or not 0 <= value <= 1e6):
-                raise ConfigError(f"{field.name} is {str(value)[:40]}, expected a number of at least 0.")
+                raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected a number of at least 0.")
         if self.worlds * self.rollout % self.batch:
             raise ConfigError(
                 f"batch is {self.batch}, expected a divisor of worlds x rollout = {self.worlds * self.rollout}."

@@ -181,7 +181,8 @@ def load(
     try:
         tensors = safetensors.torch.load(data)
     except safetensors.SafetensorError as error:
-        raise CheckpointError(f"{path} is not a safetensors file ({error}).") from error
+        said = " ".join(str(error).split())[:160]  # it may repeat what it read
+        raise CheckpointError(f"{path} is not a safetensors file ({said}).") from error
     by_name = dict((trained or model).named_parameters())
     for key, tensor in tensors.items():
         if key.startswith("optimizer/"):

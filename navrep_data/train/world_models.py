@@ -196,8 +196,8 @@ def claim(
     for name, value in settings.items():
         if name not in free and old.get(name) != value:
             raise ConfigError(
-                f"{out} was started with {name} = {str(old.get(name))[:40]}, this resume has {value}: use the settings "
-                f"in {path}, or start anew in another folder."
+                f"{out} was started with {name} = {repr(old.get(name))[:40]}, this resume has {value}: use the "
+                f"settings in {path}, or start anew in another folder."
             )
     for name in ("content_hash", "encoder", "world_model_sha256"):
         if before.get("data", {}).get(name) != data.get(name):

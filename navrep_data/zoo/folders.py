@@ -111,12 +111,13 @@ def read_policy(folder: Path | str) -> dict[str, Any]:
         raise CheckpointError(f"{path} is not the description of a policy (no format {POLICY_FORMAT!r}).")
     if found.get("format_version") != POLICY_VERSION:
         raise CheckpointError(
-            f"{path} has format version {str(found.get('format_version'))[:20]}, expected {POLICY_VERSION}: install a "
+            f"{path} has format version {repr(found.get('format_version'))[:20]}, expected {POLICY_VERSION}: install a "
             "newer navrep-data."
         )
     check_described(found, path, {"parts": ([CONTROLLER], [CONTROLLER, "world_model"], [CONTROLLER, "vae"])})
-    if not isinstance(found.get("name"), str) or not isinstance(found.get("metadata"), dict):
-        raise CheckpointError(f"{path}: name or metadata are missing; get the policy again.")
+    missing = [name for name in ("features", "lidar", "context") if name not in found]  # null is a value of theirs
+    if missing or not isinstance(found.get("name"), str) or not isinstance(found.get("metadata"), dict):
+        raise CheckpointError(f"{path}: {(missing or ['name or metadata'])[0]} is missing; get the policy again.")
     return found
 
 

@@ -6,6 +6,7 @@ the file they fall on, so that hypothesis can make smaller ones of them.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import struct
@@ -78,6 +79,7 @@ def _suffix(name: str, data: bytes) -> str:
 
 # --- bytes ------------------------------------------------------------------------------------------------------
 
+_MANY_BYTES = 4 << 20  # a file that is larger is not made forty times as large
 _INTEGERS = (0, 1, -1, 2, 255, 0x7FFF, 0x7FFFFFFF, -0x80000000, 0xFFFF, (1 << 40), (1 << 62), -(1 << 63), 1 << 20)
 
 
@@ -186,7 +188,11 @@ def _nudge(parent: Any, key: Any, value: int) -> None:
     if isinstance(old, bool):
         parent[key] = not old
     elif isinstance(old, int | float):
-        parent[key] = (old + 1, old - 1, -old, old * 1000, float(old), str(old), old + 0.5)[value % 7]
+        with contextlib.suppress(OverflowError, ValueError):  # whole numbers that no float holds, or no text
+            parent[key] = (
+                lambda: old + 1, lambda: old - 1, lambda: -old, lambda: old * 1000, lambda: float(old),
+                lambda: str(old), lambda: old + 0.5,
+            )[value % 7]()  # fmt: skip
     elif isinstance(old, str) and old:
         at = value % len(old)
         parent[key] = old[:at] + chr(32 + value % 95) + old[at + 1 :]
@@ -250,7 +256,8 @@ def edit_zip(data: bytes, edit: Edit) -> bytes | None:
         case 8:
             return _zip([*members, members[k]])
         case 9:
-            return _zip(members * 40 if edit.value % 2 else members[::-1])
+            small = sum(len(content) for *_, content in members) < _MANY_BYTES
+            return _zip(members * 40 if edit.value % 2 and small else members[::-1])
         case _:
             return _lie(data, edit)
     members[k] = (name, compression, content)

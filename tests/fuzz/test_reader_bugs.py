@@ -151,6 +151,43 @@ def test_a_training_that_stands_nowhere(files, text):
     refused(lambda: BY_NAME["training"].read(files), CheckpointError, "lacks or garbles a field")
 
 
+@pytest.mark.parametrize("name", ["checkpoint", "training"])
+def test_headers_of_safetensors_that_are_one_long_word(tmp_path, name):
+    """Found by fuzzing: the refusal repeated it whole."""
+    target = BY_NAME[name]
+    target.make(tmp_path)
+    for path in tmp_path.rglob("model.safetensors"):
+        data = path.read_bytes()
+        header = b'"' + b"a" * 50_000 + b'"'
+        path.write_bytes(len(header).to_bytes(8, "little") + header + data[8 + int.from_bytes(data[:8], "little") :])
+    for file, data in target.seal(load_files(tmp_path)).items():
+        (tmp_path / file).write_bytes(data)
+    refused(lambda: target.read(tmp_path), CheckpointError, "is not a safetensors file")
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [("checkpoint", "config.json"), ("policy", "saved/policy.json"), ("latents", "manifest.json")],
+)
+def test_versions_of_several_lines(tmp_path, name, file):
+    """Found by fuzzing: the refusal showed them as they are."""
+    target = BY_NAME[name]
+    target.make(tmp_path)
+    values = json.loads((tmp_path / file).read_bytes())
+    (tmp_path / file).write_text(json.dumps({**values, "format_version": "1\n\n"}))
+    refused(lambda: target.read(tmp_path), NavrepDataError, "has format version '1")
+
+
+@of("policy")
+@pytest.mark.parametrize("key", ["features", "lidar", "context"])
+def test_a_policy_that_does_not_say_what_it_sees(files, key):
+    path = files / "saved" / "policy.json"
+    values = json.loads(path.read_bytes())
+    del values[key]
+    path.write_text(json.dumps(values))
+    refused(lambda: BY_NAME["policy"].read(files), CheckpointError)
+
+
 # --- YAML and images --------------------------------------------------------------------------------------------
 
 
