@@ -70,9 +70,9 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path, read: bool) -> tuple
     try:
         info = archive.getinfo(f"{name}.npy")
     except KeyError:
+        has = ", ".join(found[:40] for found in archive.namelist()[:8])
         raise CorruptDataError(
-            f"{path} has no array {name!r} (it has: {', '.join(archive.namelist()[:8])}); "
-            f"expected {', '.join(_EXPECTED)}."
+            f"{path} has no array {name!r} (it has: {has}); expected {', '.join(_EXPECTED)}."
         ) from None
     if info.compress_type not in PLAIN_METHODS:
         raise CorruptDataError(f"{path}: array {name!r} is packed by method {info.compress_type}, expected deflate.")

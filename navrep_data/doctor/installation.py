@@ -32,6 +32,7 @@ KNOWN_GOOD: dict[str, str] = {
     "isal": "<2",
     "deflate": "<1",
     "filelock": "<5",
+    "fsspec": "<2027",
     "torch": "<3",
     "gymnasium": "<2",
     "stable-baselines3": "<3",

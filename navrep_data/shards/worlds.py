@@ -24,6 +24,8 @@ from navrep_data.errors import CorruptDataError
 from navrep_data.io.npz import PLAIN_METHODS
 
 MAX_WORLDS_BYTES = 256 << 20
+_DIRECTORY_ENTRY, _MAX_ENTRIES = b"PK\x01\x02", 1000
+"""What a member of a zip is announced by in its directory, and how many a worlds file may have: it has about twenty."""
 _ADVICE = "get the file again, or run the generate command again"
 # Name -> (dtype, shape after the first axis, what the first axis counts).
 _FIELDS: dict[str, tuple[str, tuple[int, ...], str]] = {
@@ -315,6 +317,9 @@ def parse_worlds(data: bytes, where: str) -> Worlds:
         If they are not a worlds file, or unpack to more than 256 MiB.
     """
     try:
+        # zipfile reads the whole directory, however long, before anybody can look at it
+        if data.count(_DIRECTORY_ENTRY) > _MAX_ENTRIES:
+            raise ValueError(f"it has more than {_MAX_ENTRIES} members")
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             names = [entry.filename for entry in archive.infolist()]
             fields = _fields_of([name.removesuffix(".npy") for name in names])

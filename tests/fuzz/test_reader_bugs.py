@@ -16,6 +16,7 @@ import pytest
 from fuzz_edits import yaml_bomb
 from fuzz_targets import TARGETS, load_files
 
+from navrep_data.datasets import import_npz
 from navrep_data.errors import CheckpointError, CorruptDataError, DatasetError, MapError, NavrepDataError
 from navrep_data.io import read_json
 from navrep_data.io.npz import read_npz
@@ -531,3 +532,20 @@ def test_one_sequence_of_more_rows_than_fit_into_memory(tmp_path, monkeypatch):
     (problem,) = verify(root).problems
     assert "30 rows take" in problem.what
     shutil.rmtree(root)
+
+
+def test_worlds_with_an_endless_directory(tmp_path):
+    path = tmp_path / "worlds.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for k in range(1500):
+            archive.writestr(f"{k}.npy", b"")
+    refused(lambda: read_worlds(path), CorruptDataError, match="more than 1000 members")
+
+
+def test_npz_with_long_names_of_arrays(tmp_path):
+    path = tmp_path / "000_scans_robotstates_actions_rewards_dones.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a" * 60_000 + ".npy", b"")
+    refused(
+        lambda: import_npz([path], tmp_path / "out"), CorruptDataError, match=r"has no array 'scans' \(it has: a{40}\)"
+    )
