@@ -92,5 +92,6 @@ def test_drive(tmp_path):
     torch.manual_seed(0)
     checkpoint.save(checkpoint.make("e2e", {"lidar": "1d"}), tmp_path / "mine")
     out = run("drive.py", "--policy", tmp_path / "mine", "--max-steps", 4, "--out", tmp_path / "d.gif")
-    assert Image.open(tmp_path / "d.gif").n_frames >= 4
+    with Image.open(tmp_path / "d.gif") as film:
+        assert film.n_frames >= 4
     assert "d.gif" in out
