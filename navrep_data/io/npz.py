@@ -35,8 +35,13 @@ def read_npz(source: BinaryIO | bytes, max_bytes: int) -> dict[str, NDArray[Any]
         If it is no such file: whatever is wrong with it.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source) as archive:
+        file = io.BytesIO(source) if isinstance(source, bytes) else source
+        size = file.seek(0, io.SEEK_END)
+        with zipfile.ZipFile(file) as archive:
             infos = archive.infolist()
+            # memory is set aside for as much as a member claims to have in the file
+            if any(info.compress_size > size for info in infos):
+                raise ValueError(f"a member of more than the file's {size:,} bytes")
             if len(infos) > _MAX_MEMBERS or sum(info.file_size for info in infos) > max_bytes:
                 raise ValueError(f"{len(infos)} members, or more than {max_bytes:,} bytes unpacked")
             if any(info.compress_type not in PLAIN_METHODS for info in infos):

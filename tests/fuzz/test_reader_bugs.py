@@ -549,3 +549,19 @@ def test_npz_with_long_names_of_arrays(tmp_path):
     refused(
         lambda: import_npz([path], tmp_path / "out"), CorruptDataError, match=r"has no array 'scans' \(it has: a{40}\)"
     )
+
+
+def test_npz_with_a_member_larger_than_its_file(tmp_path):
+    path = tmp_path / "claims.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", b"x" * 40)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"PK\x01\x02")
+    data[at + 20 : at + 24] = (0x7FFFFFF0).to_bytes(4, "little")  # its packed size, in the directory
+    path.write_bytes(data)
+
+    def read():
+        with path.open("rb") as file:
+            read_npz(file, 1 << 20)
+
+    refused(read, ValueError, match="more than the file's")
