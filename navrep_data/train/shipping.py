@@ -99,7 +99,7 @@ def ship(
     root = registry.FOLDER if root is None else root
     training = _read(Path(folder))
     _check_variant(variant, training)
-    recipe = _recipe(recipes / f"{variant}.json", variant, training, commands, [_read(Path(f)) for f in before])
+    recipe = _recipe(recipes / f"{variant}.json", variant, training, commands, [_read_stage(Path(f)) for f in before])
     parts = _parts(variant, training, world_model)
     name = f"{variant}.{OWN}"
     target = root / registry.WEIGHTS / name
@@ -126,7 +126,8 @@ def ship(
 # --- reading a training --------------------------------------------------------------------------------------------
 
 
-def _read(folder: Path) -> _Training:
+def _read_stage(folder: Path) -> _Training:
+    """Read an output folder without its networks: what counts of a stage before is what it did."""
     progress = folder / state.PROGRESS_FILE
     if not progress.is_file():
         raise CheckpointError(f"{folder} holds no training, expected {progress.name}: what navrep-data train wrote.")
@@ -134,7 +135,12 @@ def _read(folder: Path) -> _Training:
     assert last is not None
     seconds = float(read_json(last / "training.json", _MAX_JSON)["seconds"])
     step = int(read_json(progress, _MAX_JSON)["step"])
-    metadata = checkpoint.read_config(folder)["metadata"]
+    return _Training(folder, None, None, checkpoint.read_config(folder)["metadata"], step, seconds)
+
+
+def _read(folder: Path) -> _Training:
+    stage = _read_stage(folder)
+    metadata, step, seconds = stage.metadata, stage.step, stage.seconds
     if (folder / POLICY_FILE).is_file():
         policy = load_policy(folder)
         end_to_end = isinstance(policy.network, EndToEnd)

@@ -27,6 +27,7 @@ from navrep_data.models import (
     TransformerConfig,
     TransformerWorldModel,
     VAEConfig,
+    WorldModel,
 )
 from navrep_data.shards import writer_lock
 from navrep_data.train import state
@@ -121,7 +122,7 @@ def train_world_model(
     device : str
         ``"cpu"``, ``"cuda"``.
     init : nn.Module, optional
-        Start from this network's weights instead of new ones.
+        Start from this network's weights instead of new ones; a joint model or transformer may start from a V alone.
     preload : bool, optional
         Hold the dataset in memory; where it fits if left out.
     progress : bool
@@ -393,13 +394,21 @@ def machine(device: torch.device) -> dict[str, Any]:
 
 
 def _start_from(model: nn.Module, init: nn.Module) -> None:
-    """Copy weights of a network of the same kind.
+    """Copy weights of a network of the same kind; of a V alone, a world model takes its V.
 
     Raises
     ------
     CheckpointError, ConfigError
         If it is of another kind, or fed other actions.
     """
+    if isinstance(init, VAE) and isinstance(model, WorldModel):
+        if model.vae.config != init.config:
+            raise CheckpointError(
+                f"--init is a V with {init.config}, expected {model.vae.config}: train it with --lidar "
+                f"{model.vae.config.lidar} --set z_size={model.vae.config.z_size}."
+            )
+        model.vae.load_state_dict(init.state_dict())
+        return
     mine, other = getattr(model, "config", None), getattr(init, "config", None)
     wanted, seen = (getattr(c, "action_alignment", None) for c in (mine, other))
     if type(init) is type(model) and wanted != seen:

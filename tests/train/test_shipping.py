@@ -150,6 +150,16 @@ def test_stages_before_count(trained, package, dataset):
     assert "stages_before" not in alone
 
 
+def test_a_v_alone_may_be_the_stage_before(trained, package, dataset, tmp_path):
+    settings = default_recipe("v", "1d").replace(steps=1, batch=8, micro_batch=8, validate_batches=1)
+    train_world_model(settings, dataset, tmp_path / "v", preload=True)
+    options = {"commands": ["a", "b"], "root": package, "recipes": package.parent / "recipes"}
+    found = shipping.ship(trained / "w", VARIANT, dataset, before=[tmp_path / "v"], **options).training
+    assert found["stages_before"] == [settings.to_dict()]
+    with pytest.raises(CheckpointError, match="holds no training"):
+        shipping.ship(trained / "w", VARIANT, dataset, before=[tmp_path], **options)
+
+
 def test_names_lists_and_checks_know_them(trained, package, dataset, capsys):
     with pytest.raises(UnknownNameError, match=rf"means {VARIANT}\.v1.*does not contain it.*{VARIANT}\.released"):
         zoo.load(VARIANT)

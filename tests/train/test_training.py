@@ -215,6 +215,20 @@ def test_m_wants_codes_and_starts_only_from_its_own_kind(dataset, tmp_path, late
     one_line(error)
 
 
+@pytest.mark.parametrize("model", ["joint", "transformer"])
+def test_world_models_start_from_a_v(model, dataset, tmp_path):
+    v = train(recipe("v", "1d", steps=1, z_size=8), dataset, tmp_path / "v")
+    start = checkpoint.load(v.out)
+    # no learning rate: what comes out is what it started from
+    still = recipe(model, "1d", steps=1, z_size=8, h_size=16, seed=3, lr=0.0, lr_end=0.0)
+    done = checkpoint.load(train(still, dataset, tmp_path / "w", init=start).out)
+    for name, value in start.state_dict().items():
+        assert torch.equal(done.vae.state_dict()[name], value)
+    with pytest.raises(CheckpointError, match="--set z_size=16") as error:
+        train(recipe(model, "1d", steps=1, z_size=16, h_size=32), dataset, tmp_path / "other", init=start)
+    one_line(error)
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [("lr", 2.0), ("batch", 0), ("schedule", "linear"), ("steps", 1.5), ("residual", 1), ("lidar", "2d")],
