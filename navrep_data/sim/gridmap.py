@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from navrep_data.errors import ArrayError, ConfigError, MapError
 from navrep_data.sim import _grid_lidar, _map_contours
@@ -192,6 +191,8 @@ class GridMap:
     def _distance(self) -> NDArray[np.float32]:
         if not self.occupied.any():
             return np.full(self.shape, np.inf, np.float32)
+        from scipy import ndimage  # here and below: importing it takes longer than simulating a first row without maps
+
         cells = ndimage.distance_transform_edt(~self.occupied)
         # whole numbers of cells squared, then float32 as the original
         squares = np.rint(np.square(cells)).astype(np.float32)
@@ -246,6 +247,8 @@ class GridMap:
         -----
         As the original's spawn area (``pepper_2d_simulator.py``), which takes it on the map coarsened three times.
         """
+        from scipy import ndimage
+
         start = self._start_cell(xy, clearance)
         labels, _ = ndimage.label(self.signed_distance() >= clearance)
         return _read_only(labels == labels[start])
@@ -294,6 +297,8 @@ class GridMap:
             allowed = self.occupancy <= self.free_threshold
 
             def make() -> NDArray[np.bool_]:
+                from scipy import ndimage
+
                 ground = np.pad(allowed, 1)
                 for _ in range(2 if radius > 0.0 else 0):
                     # where the disc's centre may be; then, with solid and ground exchanged, what it covers

@@ -431,7 +431,7 @@ def test_distances_and_ground_are_kept_on_disk(own_cache, small_maps_on_disk, mo
     def no_more(*_):
         raise AssertionError("worked out again")
 
-    monkeypatch.setattr(gridmap.ndimage, "distance_transform_edt", no_more)
+    monkeypatch.setattr("scipy.ndimage.distance_transform_edt", no_more)
     np.testing.assert_array_equal(random_map(1).distance, distance)
     np.testing.assert_array_equal(random_map(1).ground(0.5), ground)
     with pytest.raises(AssertionError, match="worked out again"):
