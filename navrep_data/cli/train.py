@@ -285,7 +285,9 @@ def _train_controller(
         recipe = original_controller_recipe(features, lidar, modular=isinstance(model, ModularWorldModel))
     else:
         recipe = default_controller_recipe(features, lidar)
-    recipe = recipe.replace(**changes).replace(**parse_settings(recipe.to_dict(), settings))
+    # --set has the last word
+    given = {name: value for name, value in changes.items() if value is not None}
+    recipe = recipe.fit_batch(**{**given, **parse_settings(recipe.to_dict(), settings)})
     start = None if init is None else load_any_model(init, source)
     done = train_controller(
         recipe, out, model=model, model_name=name, init=start, resume=resume, stop_after=stop_after, device=device,

@@ -107,6 +107,14 @@ class ControllerRecipe:
         """Return a copy with some fields changed; None means unchanged."""
         return dataclasses.replace(self, **{name: value for name, value in changes.items() if value is not None})
 
+    def fit_batch(self, **changes: Any) -> ControllerRecipe:
+        """Return :meth:`replace`'s copy with a batch that divides its rollouts, no larger than before, unless given."""
+        if changes.get("batch") is None:
+            given = {n: v for n, v in changes.items() if n in ("worlds", "rollout") and type(v) is int and v > 0}
+            rows = given.get("worlds", self.worlds) * given.get("rollout", self.rollout)
+            changes["batch"] = next(rows // n for n in range(-(-rows // self.batch), rows + 1) if rows % n == 0)
+        return self.replace(**changes)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as plain JSON values."""
         return dataclasses.asdict(self)

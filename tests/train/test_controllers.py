@@ -84,6 +84,18 @@ def test_worlds_are_the_simulators_with_their_codes():
     assert (worlds.simulator.difficulty() <= [5, 10]).all()
 
 
+def test_batch_follows_the_worlds_unless_given():
+    recipe = default_controller_recipe("z", "1d")
+    assert recipe.fit_batch(seed=3) == recipe.replace(seed=3)
+    assert recipe.fit_batch(worlds=16).batch == 1024
+    assert recipe.fit_batch(worlds=100).batch == 3200  # half of 6400
+    assert recipe.fit_batch(worlds=16, batch=512).batch == 512
+    with pytest.raises(ConfigError, match="divisor of worlds x rollout = 1024"):
+        recipe.fit_batch(worlds=16, batch=4096)
+    with pytest.raises(ConfigError, match="worlds is 0"):
+        recipe.fit_batch(worlds=0)
+
+
 def test_speed_limit_in_numpy_and_torch_agree():
     actions = np.array([[0.3, 0.1], [3.0, 0.0], [1.0, 1.0], [-1.0, 0.5], [0.0, 0.0]], np.float32)
     found = shorten(actions, 1.0)
