@@ -49,6 +49,11 @@ class ControllerRecipe:
         Of the training worlds. Validation is in original physics, as the benchmark.
     reward_scale : float
         Factor on rewards.
+    progress : float
+        Further reward, before the factor, per metre that a step brings the robot nearer to its goal: without it
+        standing still is what early training learns, since driving ends in collisions.
+    easy_start : bool
+        Whether worlds start without humans and obstacles, for the curriculum to add; the authors' start with most.
     precision : str
         Of the frozen encoder.
     context : str
@@ -65,7 +70,7 @@ class ControllerRecipe:
     steps: int = 20_000_000
     worlds: int = 256
     rollout: int = 64
-    batch: int = 4096
+    batch: int = 1024
     epochs: int = 4
     lr: float = 5e-4
     gamma: float = 0.99
@@ -75,10 +80,12 @@ class ControllerRecipe:
     value_weight: float = 0.5
     max_grad_norm: float = 0.5
     target_kl: float = 0.03
-    hidden: int = 64
+    hidden: int = 128
     max_speed: float = 1.0
     physics: str = "consistent"
     reward_scale: float = 0.05
+    progress: float = 5.0
+    easy_start: bool = True
     precision: str = "bfloat16"
     context: str = "newest-32"
     validate_every: int = 100_000
@@ -96,6 +103,8 @@ class ControllerRecipe:
             value: Any = getattr(self, field.name)
             if field.type == "int" and (type(value) is not int or value < (0 if field.name == "seed" else 1)):
                 raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected a whole number of at least 1.")
+            if field.type == "bool" and type(value) is not bool:
+                raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected true or false.")
             if field.type == "float" and (type(value) not in (int, float) or not 0 <= value <= 1e6):
                 raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected a number of at least 0.")
         if self.worlds * self.rollout % self.batch:
@@ -123,7 +132,7 @@ class ControllerRecipe:
 def default_controller_recipe(features: str, lidar: str) -> ControllerRecipe:
     """Return our settings; end to end with fewer worlds, since its rollouts hold whole observations."""
     if features == "e2e":
-        return ControllerRecipe(features, lidar, worlds=128, rollout=64, batch=1024, lr=3e-4)
+        return ControllerRecipe(features, lidar, worlds=128, rollout=64, lr=3e-4, hidden=64)
     return ControllerRecipe(features, lidar)
 
 
@@ -131,8 +140,9 @@ def original_controller_recipe(features: str, lidar: str, modular: bool = False)
     """Return the authors' settings, as all their released runs have them (MODEL_FACTS 7)."""
     return ControllerRecipe(
         features, lidar, original=True, steps=100_000_000 if modular else 60_000_000, worlds=6, rollout=128, batch=192,
-        epochs=4, lr=2.5e-4, entropy=0.01, target_kl=0.0, max_speed=0.0, physics="original", reward_scale=1.0,
-        precision="float32", context="oldest-32", validate_every=600_000,
+        epochs=4, lr=2.5e-4, entropy=0.01, target_kl=0.0, hidden=64, max_speed=0.0, physics="original",
+        reward_scale=1.0, progress=0.0, easy_start=False, precision="float32", context="oldest-32",
+        validate_every=600_000,
     )  # fmt: skip
 
 

@@ -146,8 +146,11 @@ class _Run(BaseCallback):
         done = state.read_step(folder) if folder is not None else 0
         self.worlds = TrainingWorlds(
             environment(recipe), self.policy_now, recipe.worlds, seed=_stream(recipe, done),
-            max_speed=network.config.max_speed, reward_scale=recipe.reward_scale, truncate=not recipe.original,
+            max_speed=network.config.max_speed, reward_scale=recipe.reward_scale, progress=recipe.progress,
+            truncate=not recipe.original,
         )  # fmt: skip
+        if recipe.easy_start:
+            self.worlds.simulator.set_difficulty(np.zeros_like(self.worlds.simulator.difficulty()))
         self.ppo = make_ppo(recipe, self.worlds, network, device)
         if folder is not None:
             self.at = state.load(folder, network, self.ppo.policy.optimizer, self.ppo.policy)

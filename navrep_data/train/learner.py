@@ -20,7 +20,7 @@ from navrep_data.train.worlds import TrainingWorlds
 from navrep_data.zoo.policy import Policy
 from navrep_data.zoo.sb3 import EndToEndExtractor
 
-_GOAL_COLUMNS = 2
+_CODES = 0.2
 
 
 def make_network(recipe: ControllerRecipe, model: Any) -> Controller | EndToEnd:
@@ -53,11 +53,11 @@ def make_network(recipe: ControllerRecipe, model: Any) -> Controller | EndToEnd:
 
 @torch.no_grad()
 def scale_inputs(network: Controller, n_before: int) -> None:
-    """Start with small weights for the goal, which comes in metres, up to 18."""
+    """Start with small weights for the codes: there are many of them, and the way to the goal is what comes first."""
     for perceptron in (network.pi, network.vf):
         first = perceptron[0]
         assert isinstance(first, nn.Linear)
-        first.weight[:, n_before : n_before + _GOAL_COLUMNS] *= 0.1
+        first.weight[:, :n_before] *= _CODES
 
 
 def make_policy(recipe: ControllerRecipe, network: Controller | EndToEnd, model: Any, name: str = "") -> Policy:

@@ -30,6 +30,11 @@ def shorten(actions: F32, max_speed: float) -> F32:
     return np.asarray(clipped, np.float32)
 
 
+def _distance(state: F32) -> NDArray[np.float64]:
+    """Return the distances (W,) [m] to the goals of robot states (W, 5)."""
+    return np.hypot(state[:, 0].astype(np.float64), state[:, 1].astype(np.float64))
+
+
 class TrainingWorlds(VecEnv):
     """Worlds of one environment, seen through a policy's encoder and memory.
 
@@ -47,6 +52,8 @@ class TrainingWorlds(VecEnv):
         As in :class:`ControllerConfig`.
     reward_scale : float
         Factor on the simulator's rewards.
+    progress : float
+        Added to them, before the factor, per metre that a step which ends nothing brings the robot nearer to its goal.
     truncate : bool
         Whether timeouts are told to the learner as truncations, so that it bootstraps; the authors' software did not.
 
@@ -64,11 +71,14 @@ class TrainingWorlds(VecEnv):
         seed: int = 0,
         max_speed: float = 0.0,
         reward_scale: float = 1.0,
+        progress: float = 0.0,
         truncate: bool = True,
     ) -> None:
         self.config = config
         self.simulator = Simulator(config, n_worlds, seed=seed)
         self.policy, self.max_speed, self.reward_scale, self.truncate = policy, max_speed, reward_scale, truncate
+        self.progress = progress
+        self._to_go = np.zeros(n_worlds)
         self._actions = np.zeros((n_worlds, N_ACTIONS), np.float32)
         self._returns, self._lengths = np.zeros(n_worlds), np.zeros(n_worlds, np.int64)
         self._last = np.zeros((n_worlds, policy.n_inputs), np.float32)
@@ -87,6 +97,7 @@ class TrainingWorlds(VecEnv):
         self._returns[:], self._lengths[:] = 0.0, 0
         self.policy.reset(batch_size=self.num_envs)
         scan, state = self.simulator.observe()
+        self._to_go = _distance(state)
         self._last = self.policy.encode(scan, state)
         return self._last.copy()
 
@@ -117,6 +128,9 @@ class TrainingWorlds(VecEnv):
             self._finish(np.flatnonzero(done), events, infos)
             self.simulator.reset(done)
         scan, state = self.simulator.observe()
+        to_go = _distance(state)
+        shaped = rewards + self.progress * np.where(done, 0.0, self._to_go - to_go)
+        self._to_go = to_go
         middle = time.perf_counter()
         if ends is not None:
             for world, features in zip(cut, self._ends(ends[0][cut], ends[1][cut], self._last[cut]), strict=True):
@@ -128,7 +142,7 @@ class TrainingWorlds(VecEnv):
         self._last = self.policy.encode(scan, state)
         self.seconds["simulate"] += middle - began
         self.seconds["encode"] += time.perf_counter() - middle
-        return self._last.copy(), (rewards * self.reward_scale).astype(np.float32), done, infos
+        return self._last.copy(), (shaped * self.reward_scale).astype(np.float32), done, infos
 
     def _finish(self, worlds: NDArray[np.int64], events: NDArray[np.uint8], infos: list[dict[str, Any]]) -> None:
         now = round(time.time() - self._start, 6)

@@ -84,11 +84,39 @@ def test_worlds_are_the_simulators_with_their_codes():
     assert (worlds.simulator.difficulty() <= [5, 10]).all()
 
 
+def test_progress_is_paid_on_steps_that_end_nothing():
+    policy = Policy(Controller(ControllerConfig(21)), "z", "1d", None, world_model())
+    config = make_config("navrep-train", physics="consistent")
+    plain, paid = (TrainingWorlds(config, policy, 4, seed=5, reward_scale=0.5, progress=p) for p in (0.0, 3.0))
+    rng = np.random.default_rng(0)
+    far = np.hypot(*plain.reset()[:, 16:18].T)
+    paid.reset()
+    ends = 0
+    for _ in range(120):
+        actions = rng.uniform(-1, 1, (4, 2)).astype(np.float32)
+        plain.step_async(actions)
+        paid.step_async(actions)
+        (obs, before, done, _), (_, after, _, _) = plain.step_wait(), paid.step_wait()
+        now = np.hypot(*obs[:, 16:18].T)
+        np.testing.assert_allclose(after - before, np.where(done, 0.0, 1.5 * (far - now)), atol=1e-5)
+        far, ends = now, ends + done.sum()
+    assert ends > 0
+
+
+@pytest.mark.parametrize(("easy", "expected"), [(True, [0, 0]), (False, [5, 10])])
+def test_worlds_start_easy_or_hard(easy, expected, few_episodes, tmp_path):
+    recipe = default_controller_recipe("z", "1d").replace(**SMALL, easy_start=easy)
+    model = world_model()
+    network = controllers.make_network(recipe, model)
+    run = controllers._Run(recipe, tmp_path / "c", network, model, "W", False, False, "cpu")
+    assert (run.worlds.simulator.difficulty() == expected).all()
+
+
 def test_batch_follows_the_worlds_unless_given():
     recipe = default_controller_recipe("z", "1d")
     assert recipe.fit_batch(seed=3) == recipe.replace(seed=3)
-    assert recipe.fit_batch(worlds=16).batch == 1024
-    assert recipe.fit_batch(worlds=100).batch == 3200  # half of 6400
+    assert recipe.fit_batch(worlds=8).batch == 512
+    assert recipe.fit_batch(worlds=100).batch == 800  # an eighth of 6400; a seventh is no whole number
     assert recipe.fit_batch(worlds=16, batch=512).batch == 512
     with pytest.raises(ConfigError, match="divisor of worlds x rollout = 1024"):
         recipe.fit_batch(worlds=16, batch=4096)
