@@ -299,7 +299,7 @@ class _Run(BaseCallback):
             rate = self._success(AUTHORS_SEEDS if self.recipe.original else VALIDATION_SEEDS)
             assert self.logger_file is not None
             self.logger_file.write(self.at.step, {"val_success": rate})
-            if self.at.best is None or 1.0 - rate < self.at.best:
+            if self.at.best is None or 1.0 - rate <= self.at.best:  # of equals the later, which has learned for longer
                 self.at.best, self.at.best_step = 1.0 - rate, self.at.step
         state.save(self.out, self.network, self.ppo.policy.optimizer, self.at, self._metadata(), self.ppo.policy)
         state.commit(self.out, self.at)

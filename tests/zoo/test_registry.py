@@ -69,7 +69,9 @@ def test_records_agree_with_themselves(name):
     assert all(part in RECORDS for part in r.parts.values())
     if r.features:
         assert r.n_inputs == INPUTS[r.features](r)
-        assert r.n_parameters == 128 * r.n_inputs + 8775
+        hidden = r.training["settings"]["hidden"] if r.ours else 64
+        # two perceptrons of two layers; heads for mean, value and q; log std
+        assert r.n_parameters == 2 * hidden * (r.n_inputs + hidden + 2) + 5 * (hidden + 1) + 2
         assert (r.context_rule is not None) == (r.action_alignment is not None) == ("h" in r.features)
     for part in r.parts.values():
         assert RECORDS[part].lidar == r.lidar
