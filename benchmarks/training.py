@@ -3,8 +3,10 @@
     python benchmarks/training.py [--only transformer_rings ...] [--json]
 
 World models: one training step on frames in memory (forward, backward, AdamW), ours against the layers as they are
-written (float32, torch's transposed convolutions, everything decoded), in turns (A B A B ...). Controllers: whole PPO
-iterations (rollout in 256 worlds, encoding, update). Wall time, with as many threads as torch takes.
+written (float32, torch's transposed convolutions, everything decoded), in turns (A B A B ...). The encoder of rings in
+8 bits, as controllers are trained through it, likewise against itself in bfloat16. Controllers: whole PPO
+iterations (rollout in 256 worlds, encoding, update), as the default recipe has them. Wall time, with as many threads
+as torch takes.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from harness import in_turns, machine, ratio, spread
 
 WORLD_MODELS = ("transformer_rings", "joint_rings", "transformer_1d", "joint_1d")
 CONTROLLERS = ("rings_z", "1d_z")
+ENCODER = "encoder_rings"
 MUST = {"transformer_rings": 900, "rings_z": 10_000, "1d_z": 18_000}
 AIMS = {"transformer_rings": 1_300, "rings_z": 14_000, "1d_z": 25_000}
 WINDOWS = 32
@@ -89,33 +92,52 @@ def training_step(name: str, plain: bool) -> Callable[[], float]:
     return work
 
 
+def encoders() -> list[Callable[[], float]]:
+    """Return work that encodes 256 scans of training worlds: in 8 bits, and in bfloat16."""
+    import torch
+
+    from navrep_data.models import VAE, FrozenEncoder, QuantizedEncoder, VAEConfig, observation_from_scan
+    from navrep_data.sim import Simulator, make_config
+
+    torch.manual_seed(0)
+    vae = VAE(VAEConfig("rings", 64)).eval()
+    simulator = Simulator(make_config("navrep-train"), 256, seed=0)
+    simulator.reset()
+    obs = observation_from_scan(simulator.observe()[0], "rings")
+
+    def work(encode: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[], float]:
+        return lambda: float(len(encode(obs)))
+
+    return [work(QuantizedEncoder(vae, obs)), work(FrozenEncoder.of(vae, "bfloat16"))]
+
+
 def controller(name: str, seconds: float) -> dict[str, Any]:
     """Return steps per second of PPO iterations, and where they go."""
     import torch
 
     from navrep_data.models import TransformerConfig, TransformerWorldModel
     from navrep_data.train import controllers, default_controller_recipe
-    from navrep_data.train.controller_recipe import environment
-    from navrep_data.train.worlds import TrainingWorlds
+    from navrep_data.train.learner import make_encoder, make_worlds
 
     lidar, features = name.split("_")
     torch.manual_seed(0)
     model = TransformerWorldModel(TransformerConfig(lidar, action_alignment="taken", residual=True))
     recipe = default_controller_recipe(features, lidar)
     network = controllers.make_network(recipe, model)
-    policy = controllers.make_policy(recipe, network, model)
-    worlds = TrainingWorlds(environment(recipe), policy, recipe.worlds, max_speed=1.0)
+    worlds = make_worlds(recipe, network, model, make_encoder(recipe, model), 0)
     ppo = controllers.make_ppo(recipe, worlds, network, "cpu")
     size = recipe.worlds * recipe.rollout
     ppo.learn(size)
-    worlds.seconds = dict.fromkeys(worlds.seconds, 0.0)
+    for group in worlds.groups:
+        group.seconds = dict.fromkeys(group.seconds, 0.0)
     rates, began = [], time.perf_counter()
     while time.perf_counter() - began < seconds or len(rates) < 2:
         start = time.perf_counter()
         ppo.learn(size, reset_num_timesteps=False)
         rates.append(size / (time.perf_counter() - start))
     spent = time.perf_counter() - began
-    shares = {part: value / spent for part, value in worlds.seconds.items()}
+    # of one group's thread; the others do the same beside it
+    shares = {part: value / spent for part, value in worlds.groups[0].seconds.items()}
     found = spread(rates)
     return {"value": found["median"], "low": found["low"], "high": found["high"], "shares": shares}
 
@@ -125,7 +147,8 @@ def measure(name: str, repeats: int, seconds: float) -> dict[str, Any]:
     if name in CONTROLLERS:
         row = controller(name, repeats * seconds)
     else:
-        ours, other = in_turns([training_step(name, False), training_step(name, True)], repeats, seconds)
+        both = encoders() if name == ENCODER else [training_step(name, False), training_step(name, True)]
+        ours, other = in_turns(both, repeats, seconds)
         mine = spread(ours.wall)
         row = {
             "value": mine["median"], "low": mine["low"], "high": mine["high"],
@@ -136,7 +159,7 @@ def measure(name: str, repeats: int, seconds: float) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", default=[*WORLD_MODELS, *CONTROLLERS], metavar="NAME")
+    parser.add_argument("--only", nargs="+", default=[*WORLD_MODELS, ENCODER, *CONTROLLERS], metavar="NAME")
     parser.add_argument("--repeats", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--threads", type=int)

@@ -42,6 +42,8 @@ def kernel_cache_folder() -> Path:
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile `function` on first use, with numpy's error model, and keep it in a cache folder of its own.
 
+    Kernels let go of the interpreter's lock, so that batches of worlds step side by side in threads.
+
     Where the folder cannot be written the kernel is compiled in every process anew.
     """
     config: Any = numba.config
@@ -50,8 +52,8 @@ def kernel(function: Callable[..., Any]) -> Any:
     before = config.CACHE_DIR
     config.CACHE_DIR = _cache_folder()
     try:
-        return njit(function, cache=True, error_model="numpy")
+        return njit(function, cache=True, nogil=True, error_model="numpy")
     except (OSError, RuntimeError):
-        return njit(function, error_model="numpy")
+        return njit(function, nogil=True, error_model="numpy")
     finally:
         config.CACHE_DIR = before

@@ -23,6 +23,7 @@ from navrep_data.models.joint import JointWorldModel
 from navrep_data.models.modular import MDNRNN, Mixture, ModularWorldModel
 from navrep_data.models.noise import Noise
 from navrep_data.models.observation import observation_from_rings, observation_from_scan
+from navrep_data.models.quantized import QuantizedEncoder
 from navrep_data.models.transformer import TransformerWorldModel
 from navrep_data.models.vae import VAE, n_parameters
 from navrep_data.models.world_model import Output, Prediction, Stream, WorldModel
@@ -47,6 +48,7 @@ __all__ = [
     "Noise",
     "Output",
     "Prediction",
+    "QuantizedEncoder",
     "Stream",
     "TransformerConfig",
     "TransformerWorldModel",

@@ -28,10 +28,18 @@ from navrep_data.train.controller_recipe import (
     validation_environment,
 )
 from navrep_data.train.encode import weights_hash
-from navrep_data.train.learner import make_network, make_policy, make_ppo, network_of, scale_inputs
+from navrep_data.train.learner import (
+    make_encoder,
+    make_network,
+    make_policy,
+    make_ppo,
+    make_worlds,
+    network_of,
+    scale_inputs,
+)
 from navrep_data.train.logs import Logger, curve
 from navrep_data.train.world_models import claim, machine
-from navrep_data.train.worlds import TrainingWorlds, play
+from navrep_data.train.worlds import play
 from navrep_data.zoo.local import PARTS, POLICY_FILE
 from navrep_data.zoo.policy import Policy
 from navrep_data.zoo.sb3 import put_weights, take_weights
@@ -140,22 +148,19 @@ class _Run(BaseCallback):
     ) -> None:  # fmt: skip
         super().__init__()
         self.recipe, self.out, self.network, self.model_name = recipe, out, network, model_name
-        self.policy_now = make_policy(recipe, network, model, model_name)
+        self.encoder = make_encoder(recipe, model)
+        self.policy_now = make_policy(recipe, network, model, model_name, self.encoder)
         self.at = state.Progress()
         folder = state.last_folder(out) if resume else None
         done = state.read_step(folder) if folder is not None else 0
-        self.worlds = TrainingWorlds(
-            environment(recipe), self.policy_now, recipe.worlds, seed=_stream(recipe, done),
-            max_speed=network.config.max_speed, reward_scale=recipe.reward_scale, progress=recipe.progress,
-            truncate=not recipe.original,
-        )  # fmt: skip
+        self.worlds = make_worlds(recipe, network, model, self.encoder, _stream(recipe, done))
         if recipe.easy_start:
-            self.worlds.simulator.set_difficulty(np.zeros_like(self.worlds.simulator.difficulty()))
+            self.worlds.set_difficulty(np.zeros_like(self.worlds.difficulty()))
         self.ppo = make_ppo(recipe, self.worlds, network, device)
         if folder is not None:
             self.at = state.load(folder, network, self.ppo.policy.optimizer, self.ppo.policy)
             if "difficulty" in self.at.extra:
-                self.worlds.simulator.set_difficulty(self.at.extra["difficulty"].cpu().numpy())
+                self.worlds.set_difficulty(self.at.extra["difficulty"].cpu().numpy())
         if folder is not None or pretrained:
             put_weights(self.ppo.policy, network)
         else:  # start from stable-baselines3's orthogonal weights, but with the scaled inputs
@@ -163,6 +168,7 @@ class _Run(BaseCallback):
         self.ppo.num_timesteps = self.at.step
         self.logger_file: Logger | None = None
         self.spent, self.began, self.first = 0.0, 0.0, self.at.step
+        self.threads = torch.get_num_threads()
         self.stop_at = recipe.steps
         self.bar: Any = None
         if model is not None and not (out / PARTS).exists():
@@ -205,6 +211,7 @@ class _Run(BaseCallback):
         finally:
             self.bar.close()
             self.logger_file.close()
+            self.worlds.close()
         rate = (self.at.step - self.first) / max(1e-9, self.spent)
         held_out = self._success(AUTHORS_HELD_OUT) if self.recipe.original else None
         best = 0.0 if self.at.best is None else 1.0 - self.at.best
@@ -216,10 +223,17 @@ class _Run(BaseCallback):
 
     def _learn(self, steps: int) -> None:
         try:
+            self._use_threads(learning=True)
             self.ppo.learn(steps, callback=self, reset_num_timesteps=False)
         except ValueError:  # torch's distributions refuse what is not finite
             self._check_finite()
             raise
+        finally:
+            self._use_threads(learning=False)
+
+    def _use_threads(self, learning: bool) -> None:
+        """Leave the cores to the groups of worlds: updates are so small that more threads make them slower."""
+        torch.set_num_threads(1 if learning and len(self.worlds.groups) > 1 else self.threads)
 
     def _check_finite(self) -> None:
         """Raise where an update left weights that are not finite: nothing of that is saved."""
@@ -249,6 +263,7 @@ class _Run(BaseCallback):
         self._log(now)
         if due:
             self._checkpoint(validate=True)
+            self._use_threads(learning=True)
             self._start_worlds()
 
     def _seed(self) -> None:
@@ -259,7 +274,7 @@ class _Run(BaseCallback):
 
     def _start_worlds(self) -> None:
         """Go on as a run that resumes from this checkpoint does: in new worlds, so that no world's state is kept."""
-        self.worlds.restart(_stream(self.recipe, self.at.step), self.worlds.simulator.difficulty())
+        self.worlds.restart(_stream(self.recipe, self.at.step), self.worlds.difficulty())
         self._seed()
         self.ppo._last_obs = self.worlds.reset()
         self.ppo._last_episode_starts = np.ones(self.worlds.num_envs, bool)
@@ -271,7 +286,7 @@ class _Run(BaseCallback):
         if self.bar is not None:
             self.bar.update(now - self.bar.n)
         values = self.worlds.take_outcomes()
-        difficulty = self.worlds.simulator.difficulty().mean(0)
+        difficulty = self.worlds.difficulty().mean(0)
         std = float(self.ppo.policy.log_std.detach().exp().mean())
         found = self.ppo.logger.name_to_value
         losses: dict[str, float] = {}
@@ -290,10 +305,11 @@ class _Run(BaseCallback):
 
     def _checkpoint(self, validate: bool) -> None:
         self._check_finite()
+        self._use_threads(learning=False)
         clock = time.perf_counter()
         self.spent += clock - self.began
         self.at.step = self.ppo.num_timesteps
-        self.at.extra = {"difficulty": torch.from_numpy(self.worlds.simulator.difficulty())}
+        self.at.extra = {"difficulty": torch.from_numpy(self.worlds.difficulty())}
         take_weights(self.network, self.ppo.policy)
         if validate:
             rate = self._success(AUTHORS_SEEDS if self.recipe.original else VALIDATION_SEEDS)
@@ -309,7 +325,8 @@ class _Run(BaseCallback):
     def _success(self, seeds: range) -> float:
         """Return the share of validation episodes that end at the goal; the policy acts by its mean."""
         network = self.network
-        policy = make_policy(self.recipe, network, self.policy_now.world_model or self.policy_now.vae)
+        exact = self.recipe.replace(precision="float32")
+        policy = make_policy(exact, network, self.policy_now.world_model or self.policy_now.vae)
         ended = play(policy, validation_environment(), seeds)
         return sum(event == Event.GOAL for event in ended) / len(ended)
 

@@ -21,6 +21,7 @@ Batch = dict[str, Tensor]
 LIDAR_FIELD = {"rings": "rings", "1d": "scan"}
 # A dataset is held in memory where it takes no more than this share of what is free.
 _MEMORY_SHARE = 0.5
+_BYTES_OF_PEOPLE = 30 * 6 * 4
 _BYTES_PER_ROW = {"rings": 4096 + 64, "1d": 2160 + 64}
 
 
@@ -74,11 +75,19 @@ def _free_bytes() -> int:
         return 4 << 30
 
 
-def _fits(root: Path, lidar: str) -> bool:
-    folder = DatasetFolder(root)
-    rows = folder.manifest.rows
-    folder.close()
-    return rows * _BYTES_PER_ROW[lidar] < _MEMORY_SHARE * _free_bytes()
+def _fits(root: Path, recipe: Recipe) -> bool:
+    with DatasetFolder(root) as folder:
+        rows = folder.manifest.rows
+    people = _BYTES_OF_PEOPLE if has_people(root, recipe) else 0
+    return rows * (_BYTES_PER_ROW[recipe.lidar] + people) < _MEMORY_SHARE * _free_bytes()
+
+
+def has_people(root: Path, recipe: Recipe) -> bool:
+    """Tell whether a recipe asks for people and a dataset has them: imported ones mostly don't."""
+    if recipe.model == "m" or recipe.people_weight == 0.0:
+        return False
+    with DatasetFolder(root) as folder:
+        return "humans" in folder.manifest.columns
 
 
 def open_dataset(
@@ -93,12 +102,13 @@ def open_dataset(
             root, window=recipe.window + extra, stride=recipe.stride, split=split, action=alignment,
             across_episodes=recipe.original,
         )  # fmt: skip
-    preload = _fits(root, recipe.lidar) if preload is None else preload
+    preload = _fits(root, recipe) if preload is None else preload
     lidar: Any = recipe.lidar
+    people = ["humans"] if has_people(root, recipe) else []
     common: dict[str, Any] = {"split": split, "scan_unit": "normalized", "invalid": "range_max", "preload": preload}
     if recipe.model == "v":
-        return ScanDataset(root, lidar, **common)
-    fields = ["robot_state", "action", "goal_valid"]
+        return ScanDataset(root, lidar, fields=people, **common)
+    fields = ["robot_state", "action", "goal_valid", *people]
     if recipe.original:
         return SequenceDataset(
             root, lidar, window=recipe.window, stride=recipe.stride, fields=fields, action=alignment, targets=True,
@@ -170,13 +180,14 @@ def prepare(raw: Batch, recipe: Recipe) -> Batch:
         if recipe.lidar == "rings" and field in raw:
             raw[field][..., 0] = 0.0  # the nearest cell, as everywhere in the original but end to end
     if recipe.model == "v":
-        return {"obs": raw[name]}
+        return {"obs": raw[name], **({"humans": raw["humans"]} if "humans" in raw else {})}
     if recipe.original:
         x, y = raw, {field: raw[f"next_{field}"] for field in (name, "robot_state", "goal_valid", "mask")}
     else:
         x = {field: value[:, :-1] for field, value in raw.items()}
         y = {field: value[:, 1:] for field, value in raw.items()}
     return {
+        **({"humans": x["humans"]} if "humans" in x else {}),
         "obs": x[name],
         "next_obs": y[name],
         "mask": x["mask"],
@@ -208,6 +219,8 @@ def part(batch: Batch, first: int, stop: int) -> Batch:
     """Return windows first to stop - 1 of a prepared batch, with the observations of real rows only."""
     piece = {name: value[first:stop] for name, value in batch.items()}
     if "obs" in piece and "mask" in piece:
-        piece["obs"] = piece["obs"][piece["mask"]]
+        for name in ("obs", "humans"):
+            if name in piece:
+                piece[name] = piece[name][piece["mask"]]
         piece["next_obs"] = piece["next_obs"][piece["next_mask"]]
     return piece

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
 from navrep_data.errors import CheckpointError, ConfigError
-from navrep_data.models import Controller, ControllerConfig, EndToEnd, EndToEndConfig
+from navrep_data.models import Controller, ControllerConfig, EndToEnd, EndToEndConfig, QuantizedEncoder
+from navrep_data.models.controllers import N_ACTIONS
+from navrep_data.models.observation import observation_from_scan
+from navrep_data.models.quantized import can_quantize
 from navrep_data.models.world_model import WorldModel
-from navrep_data.schema import ROBOT_STATE_SIZE
-from navrep_data.train.controller_recipe import ControllerRecipe
+from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE
+from navrep_data.sim import Simulator
+from navrep_data.train.controller_recipe import ControllerRecipe, environment
 from navrep_data.train.encode import vae_of
 from navrep_data.train.ppo_policy import BoundedPolicy
-from navrep_data.train.worlds import TrainingWorlds
+from navrep_data.train.worlds import TrainingWorlds, WorldGroups
 from navrep_data.zoo.policy import Policy
 from navrep_data.zoo.sb3 import EndToEndExtractor
 
 _CODES = 0.2
+_WORTH_A_GROUP = 64
+_CALIBRATION, _CALIBRATION_STEPS = 512, 25
 
 
 def make_network(recipe: ControllerRecipe, model: Any) -> Controller | EndToEnd:
@@ -60,25 +67,70 @@ def scale_inputs(network: Controller, n_before: int) -> None:
         first.weight[:, :n_before] *= _CODES
 
 
-def make_policy(recipe: ControllerRecipe, network: Controller | EndToEnd, model: Any, name: str = "") -> Policy:
-    """Return the policy that a controller makes with its world model.
+def make_encoder(recipe: ControllerRecipe, model: Any) -> QuantizedEncoder | None:
+    """Return the encoder to train through where the recipe asks for 8 bits, None where the policy makes its own.
+
+    Notes
+    -----
+    It is calibrated on worlds of the training environment, always the same, so that a resume has the same encoder.
+    """
+    if recipe.features == "e2e" or recipe.precision != "int8" or not can_quantize():
+        return None
+    simulator = Simulator(environment(recipe), _CALIBRATION, seed=0)
+    simulator.reset()
+    draw = np.random.default_rng(0)
+    for _ in range(_CALIBRATION_STEPS):
+        commands = np.zeros((_CALIBRATION, ACTION_SIZE))
+        commands[:, :N_ACTIONS] = draw.uniform(-1.0, 1.0, (_CALIBRATION, N_ACTIONS))
+        _, events = simulator.step(commands)
+        simulator.reset(events != 0)
+    return QuantizedEncoder(
+        vae_of(model, "The world model"), observation_from_scan(simulator.observe()[0], recipe.lidar)
+    )
+
+
+def make_policy(
+    recipe: ControllerRecipe, network: Controller | EndToEnd, model: Any, name: str = "",
+    encoder: QuantizedEncoder | None = None,
+) -> Policy:  # fmt: skip
+    """Return the policy that a controller makes with its world model, encoding by `encoder` where there is one.
 
     Raises
     ------
     CheckpointError, ConfigError
         If they do not fit.
     """
+    dtype = "bfloat16" if recipe.precision == "int8" else recipe.precision
     if recipe.features == "e2e":
-        return Policy(network, None, recipe.lidar, name=name, dtype=recipe.precision)
+        return Policy(network, None, recipe.lidar, name=name, dtype=dtype)
     world_model = model if isinstance(model, WorldModel) and "h" in recipe.features else None
     context = None if world_model is None or world_model.default_context == "carried-state" else recipe.context
     return Policy(
         network, recipe.features, recipe.lidar, vae_of(model, name), world_model, name=name, context=context,
-        dtype=recipe.precision,
+        dtype=dtype, encoder=encoder,
     )  # fmt: skip
 
 
-def make_ppo(recipe: ControllerRecipe, worlds: TrainingWorlds, network: Controller | EndToEnd, device: str) -> PPO:
+def make_worlds(
+    recipe: ControllerRecipe, network: Controller | EndToEnd, model: Any, encoder: QuantizedEncoder | None, seed: int
+) -> WorldGroups:
+    """Return the worlds to train in, in as many groups as torch has threads, if they are large enough to be worth it.
+
+    Every group has a policy of its own, since that keeps the memories of its worlds.
+    """
+
+    def make(n_worlds: int, first_sequence: int) -> TrainingWorlds:
+        return TrainingWorlds(
+            environment(recipe), make_policy(recipe, network, model, "", encoder), n_worlds, seed=seed,
+            first_sequence=first_sequence, max_speed=network.config.max_speed, reward_scale=recipe.reward_scale,
+            progress=recipe.progress, truncate=not recipe.original,
+        )  # fmt: skip
+
+    n_groups = max(1, min(torch.get_num_threads(), recipe.worlds // _WORTH_A_GROUP))
+    return WorldGroups(make, recipe.worlds, n_groups)
+
+
+def make_ppo(recipe: ControllerRecipe, worlds: WorldGroups, network: Controller | EndToEnd, device: str) -> PPO:
     """Return the learner, with the network's weights."""
     kwargs: dict[str, Any] = {
         "net_arch": {"pi": [network.config.n_hidden] * 2, "vf": [network.config.n_hidden] * 2},

@@ -23,6 +23,7 @@ from navrep_data.models.noise import sample
 from navrep_data.models.world_model import LSTMState, WorldModel
 from navrep_data.schema import RANGE_MAX
 from navrep_data.train import passes
+from navrep_data.train.cues import Cues
 from navrep_data.train.recipe import Recipe
 
 _LOG_ROOT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
@@ -81,8 +82,23 @@ def kl_weight(recipe: Recipe, step: int) -> float:
     return recipe.kl_weight * min(1.0, (step + 1) / recipe.kl_warmup) if recipe.kl_warmup else recipe.kl_weight
 
 
-def vae_loss(vae: VAE, obs: Tensor, recipe: Recipe, step: int, noise: Noise | None, counts: Counts) -> Terms:
-    """Return V's loss on a part (N, ...) of a batch."""
+def cue_loss(
+    cues: Cues | None, mu: Tensor, batch: dict[str, Tensor], recipe: Recipe, counts: Counts
+) -> tuple[Tensor, dict[str, float]]:
+    """Return the weighted cost of cues over the rows of a part of a batch, and its summands."""
+    if cues is None:
+        return mu.new_zeros(()), {}
+    ranges, people = (each.sum() / counts.rows for each in cues.errors(mu, batch["obs"], batch.get("humans")))
+    cost = recipe.ranges_weight * ranges + recipe.people_weight * people
+    return cost, {"cue_ranges": float(ranges.detach()), "cue_people": float(people.detach())}
+
+
+def vae_loss(
+    vae: VAE, batch: dict[str, Tensor], recipe: Recipe, step: int, noise: Noise | None, counts: Counts,
+    cues: Cues | None = None,
+) -> Terms:  # fmt: skip
+    """Return V's loss on a part of a batch: `obs` (N, ...), and `humans` where people are asked for."""
+    obs = batch["obs"]
     dtype = passes.PRECISIONS[recipe.precision]
     mu, logvar = passes.distribution(vae, obs, dtype)
     logits = passes.decode_logits(vae, sample(mu, logvar, noise), dtype)
@@ -91,8 +107,9 @@ def vae_loss(vae: VAE, obs: Tensor, recipe: Recipe, step: int, noise: Noise | No
     if recipe.original:  # floored per frame
         kl = kl.clamp_min(recipe.kl_floor)
     kl = kl.sum() / counts.rows
-    parts = {"rec": float(rec.detach()), "kl": float(kl.detach())}
-    return Terms(rec + kl_weight(recipe, step) * kl, parts)
+    asked, found = cue_loss(cues, mu, batch, recipe, counts)
+    parts = {"rec": float(rec.detach()), "kl": float(kl.detach()), **found}
+    return Terms(rec + kl_weight(recipe, step) * kl + asked, parts)
 
 
 def world_model_loss(
@@ -102,6 +119,7 @@ def world_model_loss(
     step: int,
     noise: Noise | None,
     counts: Counts,
+    cues: Cues | None = None,
 ) -> Terms:
     """Return the loss of a joint model or a transformer on a part of a batch.
 
@@ -121,6 +139,8 @@ def world_model_loss(
         Samples z, and drops out; None = validation.
     counts : Counts
         Of the whole batch.
+    cues : Cues, optional
+        Head that z is asked through; `batch` then has `humans` of the real rows where people are asked for.
     """
     dtype = passes.PRECISIONS[recipe.precision]
     mask, next_mask = batch["mask"], batch["next_mask"]
@@ -144,8 +164,9 @@ def world_model_loss(
     error = (next_goal - batch["next_goal"])[batch["goal_mask"]].square().mean(-1).sum()
     goal = error / max(1.0, counts.targets) / recipe.goal_scale**2
     parts = {"rec": rec, "pred": pred, "kl": kl, "goal": goal}
-    total = rec + pred + goal + kl_weight(recipe, step) * kl_cost
-    return Terms(total, {name: float(value.detach()) for name, value in parts.items()})
+    asked, found = cue_loss(cues, mu_rows, batch, recipe, counts)
+    total = rec + pred + goal + kl_weight(recipe, step) * kl_cost + asked
+    return Terms(total, {**{name: float(value.detach()) for name, value in parts.items()}, **found})
 
 
 def _zero_state(model: WorldModel, z: Tensor) -> LSTMState | None:

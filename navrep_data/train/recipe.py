@@ -41,6 +41,8 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "reconstruct_share": (0.01, 1.0),
     "predict_share": (0.01, 1.0),
     "restart_factor": (0.0, 1000.0),
+    "ranges_weight": (0.0, 100.0),
+    "people_weight": (0.0, 100.0),
     "seed": (0, 2**31 - 1),
     "z_size": (1, 512),
     "h_size": (1, 4096),
@@ -110,6 +112,10 @@ class Recipe:
         Share of the rows, drawn anew every step, whose reconstruction and prediction are decoded and compared.
     restart_factor : float
         M: weight, in the restart loss, of rows whose next row is an episode's last.
+    ranges_weight, people_weight : float
+        v, joint and transformer: weights of the errors of a linear head on z, thrown away afterwards, that says how
+        near things and people are; see :mod:`navrep_data.train.cues`. 0 = not asked; people are only asked for where
+        the dataset has a `humans` column.
     precision : str
         ``"bfloat16"`` or ``"float32"``, of V's passes; weights, memory and losses are float32.
     seed : int
@@ -150,6 +156,8 @@ class Recipe:
     reconstruct_share: float = 0.25
     predict_share: float = 0.5
     restart_factor: float = 10.0
+    ranges_weight: float = 0.05
+    people_weight: float = 0.1
     precision: str = "bfloat16"
     seed: int = 0
     validate_every: int = 1000
@@ -226,7 +234,7 @@ def default_recipe(model: str, lidar: str) -> Recipe:
         case "m":
             return Recipe(
                 model, lidar, z_size=32, h_size=512, batch=64, micro_batch=64, window=64, stride=64, kl_weight=0.0,
-                goal_scale=25.0,
+                goal_scale=25.0, ranges_weight=0.0, people_weight=0.0,
             )  # fmt: skip
         case "joint":
             return Recipe(
@@ -247,6 +255,7 @@ def original_recipe(model: str, lidar: str) -> Recipe:
     common: dict[str, Any] = {
         "original": True, "action_alignment": "leading", "residual": False, "steps": steps, "precision": "float32",
         "reconstruct_share": 1.0, "predict_share": 1.0, "kl_warmup": 0, "seed": 42, "goal_scale": 25.0,
+        "ranges_weight": 0.0, "people_weight": 0.0,
     }  # fmt: skip
     if model == "v":
         # Adam as TensorFlow has it; KL per frame floored at half a nat per latent

@@ -14,6 +14,7 @@ from navrep_data.models import MDNRNN, VAE, Noise
 from navrep_data.models.noise import sample
 from navrep_data.models.world_model import WorldModel
 from navrep_data.train import passes
+from navrep_data.train.cues import Cues
 from navrep_data.train.data import Batch, part
 from navrep_data.train.losses import Counts, Terms, memory_loss, observation_loss, vae_loss, world_model_loss
 from navrep_data.train.recipe import Recipe
@@ -53,11 +54,16 @@ def _to(batch: Batch, device: torch.device) -> Batch:
     return batch if device.type == "cpu" else {name: value.to(device) for name, value in batch.items()}
 
 
+def _cue_sums(cues: Cues, mu: Tensor, batch: Batch) -> dict[str, float]:
+    ranges, people = cues.errors(mu, batch["obs"], batch.get("humans"))
+    return {"cue_ranges": float(ranges.sum()), "cue_people": float(people.sum())}
+
+
 class VAETask:
     """V."""
 
-    def __init__(self, model: VAE, recipe: Recipe, device: torch.device) -> None:
-        self.model, self.recipe, self.device = model, recipe, device
+    def __init__(self, model: VAE, recipe: Recipe, device: torch.device, cues: Cues | None = None) -> None:
+        self.model, self.recipe, self.device, self.cues = model, recipe, device, cues
         self.extra: dict[str, Tensor] = {}
 
     def parts(self, batch: Batch, step: int) -> Iterator[Terms]:
@@ -65,8 +71,8 @@ class VAETask:
         noise = Noise(generator(self.recipe, step, _NOISE, self.device), 0.0)
         n = len(batch["obs"])
         for first, stop in _slices(n, self.recipe.micro_batch):
-            obs = batch["obs"][first:stop].to(self.device)
-            yield vae_loss(self.model, obs, self.recipe, step, noise, Counts(n, 0, n, 0))
+            piece = {name: value[first:stop].to(self.device) for name, value in batch.items()}
+            yield vae_loss(self.model, piece, self.recipe, step, noise, Counts(n, 0, n, 0), self.cues)
 
     @torch.no_grad()
     def validate(self, batch: Batch) -> tuple[dict[str, float], float]:
@@ -76,7 +82,10 @@ class VAETask:
         mu, _ = passes.distribution(self.model, obs, dtype)
         decoded = torch.sigmoid(passes.decode_logits(self.model, mu, dtype))
         error = float((decoded - obs).square().flatten(1).mean(1).sum())
-        return {"rec_mse": error, "error": error}, len(obs)
+        sums = {"rec_mse": error, "error": error}
+        if self.cues is not None:
+            sums |= _cue_sums(self.cues, mu, _to(batch, self.device))
+        return sums, len(obs)
 
     @torch.no_grad()
     def images(self, batch: Batch) -> dict[str, NDArray[Any]]:
@@ -88,8 +97,8 @@ class VAETask:
 class WorldModelTask:
     """Joint model or transformer."""
 
-    def __init__(self, model: WorldModel, recipe: Recipe, device: torch.device) -> None:
-        self.model, self.recipe, self.device = model, recipe, device
+    def __init__(self, model: WorldModel, recipe: Recipe, device: torch.device, cues: Cues | None = None) -> None:
+        self.model, self.recipe, self.device, self.cues = model, recipe, device, cues
         self.extra: dict[str, Tensor] = {}
 
     def parts(self, batch: Batch, step: int) -> Iterator[Terms]:
@@ -113,7 +122,7 @@ class WorldModelTask:
         noise = Noise(generator(recipe, step, _NOISE, self.device), recipe.dropout)
         for first, stop in _slices(len(mask), recipe.micro_batch):
             piece = _to(part(batch, first, stop), self.device)
-            yield world_model_loss(self.model, piece, recipe, step, noise, counts)
+            yield world_model_loss(self.model, piece, recipe, step, noise, counts, self.cues)
 
     @torch.no_grad()
     def validate(self, batch: Batch) -> tuple[dict[str, float], float]:
@@ -121,6 +130,8 @@ class WorldModelTask:
         recipe, model = self.recipe, self.model
         dtype = passes.PRECISIONS[recipe.precision]
         sums = {"rec_mse": 0.0, "pred_mse": 0.0, "pred_loss": 0.0, "goal_mse_m2": 0.0, "error": 0.0}
+        if self.cues is not None:
+            sums |= {"cue_ranges": 0.0, "cue_people": 0.0}
         for first, stop in _slices(len(batch["mask"]), recipe.micro_batch):
             piece = _to(part(batch, first, stop), self.device)
             mask, next_mask = piece["mask"], piece["next_mask"]
@@ -132,7 +143,12 @@ class WorldModelTask:
             # rows with a successor only, so that both errors are means over the same rows
             rec = passes.decode_logits(model.vae, z[next_mask], dtype)
             pred = passes.decode_logits(model.vae, next_z[next_mask], dtype)
-            now = piece["obs"][next_mask[mask]]
+            at = next_mask[mask]
+            now = piece["obs"][at]
+            if self.cues is not None:
+                rows: Batch = {name: piece[name][at] for name in ("obs", "humans") if name in piece}
+                for name, value in _cue_sums(self.cues, mu[at], rows).items():
+                    sums[name] += value
             sums["rec_mse"] += float((torch.sigmoid(rec) - now).square().flatten(1).mean(1).sum())
             squared = (torch.sigmoid(pred) - piece["next_obs"]).square().flatten(1).mean(1)
             sums["pred_mse"] += float(squared.sum())
@@ -191,11 +207,11 @@ class MemoryTask:
         return
 
 
-def make_task(model: nn.Module, recipe: Recipe, device: torch.device) -> Task:
-    """Return the task of a model."""
+def make_task(model: nn.Module, recipe: Recipe, device: torch.device, cues: Cues | None = None) -> Task:
+    """Return the task of a model, with the head for cues where the recipe asks for them."""
     if isinstance(model, VAE):
-        return VAETask(model, recipe, device)
+        return VAETask(model, recipe, device, cues)
     if isinstance(model, MDNRNN):
         return MemoryTask(model, recipe, device)
     assert isinstance(model, WorldModel)
-    return WorldModelTask(model, recipe, device)
+    return WorldModelTask(model, recipe, device, cues)

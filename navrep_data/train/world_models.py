@@ -31,6 +31,8 @@ from navrep_data.models import (
 )
 from navrep_data.shards import writer_lock
 from navrep_data.train import state
+from navrep_data.train.cues import Cues
+from navrep_data.train.cues import wanted as cues_wanted
 from navrep_data.train.data import Batches, describe_dataset, open_dataset
 from navrep_data.train.logs import Logger, picture
 from navrep_data.train.optim import clip, learning_rate, make_optimizer
@@ -225,12 +227,18 @@ class _Loop:
         if init is not None:
             _start_from(self.model, init)
         self.model.to(device)
-        self.optimizer = make_optimizer(self.model, recipe)
+        self.cues = Cues(recipe.z_size, recipe.lidar).to(device) if cues_wanted(recipe) else None
+        # all that is optimised; the head for cues is part of a checkpoint's state, not of its weights
+        self.trained = self.model if self.cues is None else nn.ModuleDict({"model": self.model, "cues": self.cues})
+        self.optimizer = make_optimizer(self.trained, recipe)
         self.progress = state.Progress()
-        self.task: Task = make_task(self.model, recipe, device)
+        self.task: Task = make_task(self.model, recipe, device, self.cues)
         folder = state.last_folder(out)
         if folder is not None:
-            self.progress = state.load(folder, self.model, self.optimizer)
+            self.progress = state.load(folder, self.model, self.optimizer, self.trained)
+            if self.cues is not None:
+                head = {name: self.progress.extra.pop(f"cues.{name}") for name in ("weight", "bias")}
+                self.cues.load_state_dict(head)
             self.task.extra = self.progress.extra
         self.train = Batches(open_dataset(data, recipe, "train", preload), recipe)
         self.valid = self._validation(data, preload)
@@ -299,7 +307,7 @@ class _Loop:
             total += value
             for name, one in terms.parts.items():
                 sums[name] = sums.get(name, 0.0) + one
-        norm = clip(self.model, recipe)
+        norm = clip(self.trained, recipe)
         if not math.isfinite(norm):
             self._stop_at(norm, {"gradient norm": norm})
         self.optimizer.step()
@@ -327,8 +335,9 @@ class _Loop:
         if last or at.step % recipe.picture_every == 0:
             self._picture(logger, batch)
         if last or better or at.step % recipe.save_every == 0:
-            at.extra = self.task.extra
-            state.save(self.out, self.model, self.optimizer, at, self._metadata())
+            head = {} if self.cues is None else {f"cues.{n}": t for n, t in self.cues.state_dict().items()}
+            at.extra = {**self.task.extra, **head}
+            state.save(self.out, self.model, self.optimizer, at, self._metadata(), self.trained)
             state.commit(self.out, at)
             # the authors used what training ended with
             state.publish(self.out, at.step if recipe.original or at.best is None else at.best_step)

@@ -1,12 +1,15 @@
-"""Hundreds of worlds as one stable-baselines3 VecEnv: stepped in one call, encoded in one batch."""
+"""Hundreds of worlds as one stable-baselines3 VecEnv: stepped in one call per thread, encoded in one batch each."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
@@ -35,7 +38,30 @@ def _distance(state: F32) -> NDArray[np.float64]:
     return np.hypot(state[:, 0].astype(np.float64), state[:, 1].astype(np.float64))
 
 
-class TrainingWorlds(VecEnv):
+class _Batch(VecEnv):
+    """What VecEnv asks for beside steps, for worlds that are nothing by themselves."""
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute for each of the worlds asked for; they share it."""
+        return [getattr(self, attr_name, None)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refuse: worlds have no attributes of their own."""
+        raise SimulationError(f"{attr_name!r} cannot be set for single worlds of a batch.")
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Refuse: worlds have no methods of their own."""
+        raise SimulationError(f"{method_name!r} cannot be called on single worlds of a batch.")
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        """Return False for each world asked for: the statistics are those of the simulator."""
+        return [False] * len(list(self._get_indices(indices)))
+
+
+class TrainingWorlds(_Batch):
     """Worlds of one environment, seen through a policy's encoder and memory.
 
     Parameters
@@ -46,8 +72,8 @@ class TrainingWorlds(VecEnv):
         Whose encoder and memory make the observations; its controller is not used.
     n_worlds : int
         Worlds that step together.
-    seed : int
-        Of the worlds.
+    seed, first_sequence : int
+        Of the worlds, see :class:`navrep_data.sim.Simulator`.
     max_speed : float
         As in :class:`ControllerConfig`.
     reward_scale : float
@@ -69,13 +95,15 @@ class TrainingWorlds(VecEnv):
         n_worlds: int,
         *,
         seed: int = 0,
+        first_sequence: int = 0,
         max_speed: float = 0.0,
         reward_scale: float = 1.0,
         progress: float = 0.0,
         truncate: bool = True,
     ) -> None:
         self.config = config
-        self.simulator = Simulator(config, n_worlds, seed=seed)
+        self.simulator = Simulator(config, n_worlds, seed=seed, first_sequence=first_sequence)
+        self.first_sequence = first_sequence
         self.policy, self.max_speed, self.reward_scale, self.truncate = policy, max_speed, reward_scale, truncate
         self.progress = progress
         self._to_go = np.zeros(n_worlds)
@@ -103,9 +131,17 @@ class TrainingWorlds(VecEnv):
 
     def restart(self, seed: int, difficulty: NDArray[np.int64]) -> None:
         """Go on in worlds from another stream, as difficult as given; call :meth:`reset` next."""
-        self.simulator = Simulator(self.config, self.num_envs, seed=seed)
-        self.simulator.set_difficulty(difficulty)
+        self.simulator = Simulator(self.config, self.num_envs, seed=seed, first_sequence=self.first_sequence)
+        self.set_difficulty(difficulty)
         self.outcomes = []
+
+    def difficulty(self) -> NDArray[np.int64]:
+        """Return the present numbers of humans and obstacles (W, 2)."""
+        return self.simulator.difficulty()
+
+    def set_difficulty(self, difficulty: NDArray[np.int64]) -> None:
+        """Set it for the episodes that start from now on."""
+        self.simulator.set_difficulty(difficulty)
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Take the actions of the next step."""
@@ -161,30 +197,75 @@ class TrainingWorlds(VecEnv):
         n_memory = self.policy.world_model.h_size if self.policy.world_model is not None else 0
         return np.concatenate([fresh, before[:, before.shape[1] - n_memory :]], axis=1) if n_memory else fresh
 
-    # --- what VecEnv asks for ----------------------------------------------------------------------------------
+    def take_outcomes(self) -> list[Event]:
+        """Return how episodes ended since the last call, and forget it."""
+        events, self.outcomes = self.outcomes, []
+        return events
 
-    def close(self) -> None:
-        """Nothing is open."""
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute for each of the worlds asked for; they share it."""
-        return [getattr(self, attr_name, None)] * len(list(self._get_indices(indices)))
+class WorldGroups(_Batch):
+    """Training worlds in groups that step and encode at the same time, each in a thread of its own.
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse: worlds have no attributes of their own."""
-        raise SimulationError(f"{attr_name!r} cannot be set for single worlds of a batch.")
+    Parameters
+    ----------
+    make : callable
+        Takes the number of a group's worlds and its first sequence, returns its :class:`TrainingWorlds`.
+    n_worlds : int
+        Worlds in all.
+    n_groups : int
+        At most as many as worlds.
 
-    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Refuse: worlds have no methods of their own."""
-        raise SimulationError(f"{method_name!r} cannot be called on single worlds of a batch.")
+    Notes
+    -----
+    World w is the same whatever the number of groups. Two halves side by side take all of two cores; one batch leaves
+    the second one idle while kernels and Python run.
+    """
 
-    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Return False for each world asked for: the statistics are those of the simulator."""
-        return [False] * len(list(self._get_indices(indices)))
+    def __init__(self, make: Callable[[int, int], TrainingWorlds], n_worlds: int, n_groups: int) -> None:
+        firsts = [n_worlds * k // n_groups for k in range(n_groups + 1)]
+        self.groups = [make(stop - first, first) for first, stop in pairwise(firsts)]
+        self._slices = [slice(first, stop) for first, stop in pairwise(firsts)]
+        self._pool = ThreadPoolExecutor(n_groups, "navrep-data-worlds", lambda: torch.set_num_threads(1))
+        first = self.groups[0]
+        super().__init__(n_worlds, first.observation_space, first.action_space)
+
+    def _each(self, work: Callable[[TrainingWorlds, slice], Any]) -> list[Any]:
+        """Do something with every group and its worlds' slice, side by side."""
+        if len(self.groups) == 1:
+            return [work(self.groups[0], self._slices[0])]
+        return list(self._pool.map(work, self.groups, self._slices))
+
+    def reset(self) -> F32:
+        """Start an episode in every world."""
+        return np.concatenate(self._each(lambda group, _: group.reset()))
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Take the actions of the next step."""
+        for group, worlds in zip(self.groups, self._slices, strict=True):
+            group.step_async(actions[worlds])
+
+    def step_wait(self) -> tuple[F32, F32, NDArray[np.bool_], list[dict[str, Any]]]:
+        """Step all worlds; those whose episode ends start the next one."""
+        found = self._each(lambda group, _: group.step_wait())
+        seen, rewards, done = (np.concatenate([one[k] for one in found]) for k in range(3))
+        return seen, rewards, done, [info for one in found for info in one[3]]
+
+    def restart(self, seed: int, difficulty: NDArray[np.int64]) -> None:
+        """Go on in worlds from another stream, as difficult as given; call :meth:`reset` next."""
+        self._each(lambda group, worlds: group.restart(seed, difficulty[worlds]))
+
+    def difficulty(self) -> NDArray[np.int64]:
+        """Return the present numbers of humans and obstacles (W, 2)."""
+        return np.concatenate([group.difficulty() for group in self.groups])
+
+    def set_difficulty(self, difficulty: NDArray[np.int64]) -> None:
+        """Set it for the episodes that start from now on."""
+        for group, worlds in zip(self.groups, self._slices, strict=True):
+            group.set_difficulty(difficulty[worlds])
 
     def take_outcomes(self) -> dict[str, float]:
         """Return the shares of the outcomes since the last call, and forget them."""
-        events, self.outcomes = self.outcomes, []
+        events = [event for group in self.groups for event in group.take_outcomes()]
         n = max(1, len(events))
         return {
             "episodes": float(len(events)),
@@ -192,6 +273,10 @@ class TrainingWorlds(VecEnv):
             "collision": sum(e in (Event.COLLISION_HUMAN, Event.COLLISION_OBSTACLE) for e in events) / n,
             "timeout": sum(e == Event.TIMEOUT for e in events) / n,
         }
+
+    def close(self) -> None:
+        """End the threads."""
+        self._pool.shutdown()
 
 
 def play(policy: Policy, config: SimConfig, numpy_seeds: Sequence[int]) -> list[Event]:

@@ -62,6 +62,9 @@ class Policy:
         Compile the encoder by torch.compile.
     device : str
         Where the networks run.
+    encoder : nn.Module, optional
+        Observations to z, made beforehand from `vae` instead of by `dtype` and `compile`, such as a
+        :class:`navrep_data.models.QuantizedEncoder`.
     sensor : SensorContract
         What scans must be.
 
@@ -92,6 +95,7 @@ class Policy:
         dtype: str = "float32",
         compile: bool = False,
         device: str | torch.device = "cpu",
+        encoder: torch.nn.Module | None = None,
         sensor: SensorContract | None = None,
     ) -> None:
         if inference not in INFERENCE:
@@ -110,7 +114,7 @@ class Policy:
         for part in (self.vae, self.world_model):
             if part is not None:
                 part.to(self.device).eval()
-        self._encoder = self._make_encoder(dtype, compile)
+        self._encoder = self._make_encoder(dtype, compile) if encoder is None else encoder
         self._stream: Stream | None = None
         self._noise: Noise | None = None
         # what the memory is fed one step later, once the action taken is known
@@ -141,7 +145,7 @@ class Policy:
     def _who(self) -> str:
         return self.name or "This policy"
 
-    def _make_encoder(self, dtype: str, compile: bool) -> FrozenEncoder | None:
+    def _make_encoder(self, dtype: str, compile: bool) -> torch.nn.Module | None:
         if isinstance(self.network, EndToEnd):
             net = self.network
             return FrozenEncoder(net.encoder, net.fc, net.config.lidar, dtype, compile).to(self.device)

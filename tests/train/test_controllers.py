@@ -6,11 +6,11 @@ import torch
 
 from navrep_data import zoo
 from navrep_data.errors import CheckpointError, ConfigError, DatasetMismatchError, TrainingError
-from navrep_data.models import Controller, ControllerConfig, checkpoint
+from navrep_data.models import Controller, ControllerConfig, checkpoint, quantized
 from navrep_data.models.controllers import limit_speed
 from navrep_data.schema import Event
 from navrep_data.sim import Simulator, make_config
-from navrep_data.train import controllers
+from navrep_data.train import controllers, learner
 from navrep_data.train.controller_recipe import (
     AUTHORS_SEEDS,
     VALIDATION_SEEDS,
@@ -20,7 +20,7 @@ from navrep_data.train.controller_recipe import (
 )
 from navrep_data.train.logs import read_log
 from navrep_data.train.state import last_folder
-from navrep_data.train.worlds import TrainingWorlds, play, shorten
+from navrep_data.train.worlds import TrainingWorlds, WorldGroups, play, shorten
 from navrep_data.zoo.local import load_any_model
 from navrep_data.zoo.policy import Policy
 
@@ -80,7 +80,7 @@ def test_worlds_are_the_simulators_with_their_codes():
                 np.testing.assert_allclose(infos[w]["terminal_observation"], last[w], rtol=1e-4, atol=1e-4)
         twin.reset(done)
     assert ends > 3
-    assert worlds.take_outcomes()["episodes"] == ends
+    assert len(worlds.take_outcomes()) == ends
     assert (worlds.simulator.difficulty() <= [5, 10]).all()
 
 
@@ -103,22 +103,63 @@ def test_progress_is_paid_on_steps_that_end_nothing():
     assert ends > 0
 
 
+def test_groups_of_worlds_are_the_worlds_of_one_batch():
+    """Same streams, same codes, same rewards, however many threads step them."""
+    model = world_model()
+    recipe = default_controller_recipe("zh", "1d").replace(worlds=12, batch=48, precision="float32")
+    network = learner.make_network(recipe, model)
+
+    def make(n_worlds, first_sequence):
+        policy = learner.make_policy(recipe, network, model)
+        return TrainingWorlds(
+            environment(recipe), policy, n_worlds, seed=4, first_sequence=first_sequence, progress=2.0
+        )
+
+    whole, parts = (WorldGroups(make, 12, n) for n in (1, 3))
+    assert [group.num_envs for group in parts.groups] == [4, 4, 4]
+    np.testing.assert_allclose(whole.reset(), parts.reset(), atol=1e-5)
+    draw = np.random.default_rng(0)
+    ended = 0
+    for _ in range(60):
+        actions = draw.uniform(-1.0, 1.0, (12, 2)).astype(np.float32)
+        results = []
+        for worlds in (whole, parts):
+            worlds.step_async(actions)
+            results.append(worlds.step_wait())
+        (seen, rewards, done, infos), (seen_2, rewards_2, done_2, infos_2) = results
+        np.testing.assert_allclose(seen, seen_2, atol=1e-4)
+        np.testing.assert_array_equal(rewards, rewards_2)
+        np.testing.assert_array_equal(done, done_2)
+        assert [info.get("event") for info in infos] == [info.get("event") for info in infos_2]
+        ended += int(done.sum())
+    assert ended > 0
+    np.testing.assert_array_equal(whole.difficulty(), parts.difficulty())
+    assert whole.take_outcomes() == parts.take_outcomes()
+    hard = np.arange(24).reshape(12, 2) % 5
+    for worlds in (whole, parts):
+        worlds.restart(9, hard)
+        np.testing.assert_array_equal(worlds.difficulty(), hard)
+    np.testing.assert_allclose(whole.reset(), parts.reset(), atol=1e-5)
+    whole.close()
+    parts.close()
+
+
 @pytest.mark.parametrize(("easy", "expected"), [(True, [0, 0]), (False, [5, 10])])
 def test_worlds_start_easy_or_hard(easy, expected, few_episodes, tmp_path):
     recipe = default_controller_recipe("z", "1d").replace(**SMALL, easy_start=easy)
     model = world_model()
     network = controllers.make_network(recipe, model)
     run = controllers._Run(recipe, tmp_path / "c", network, model, "W", False, False, "cpu")
-    assert (run.worlds.simulator.difficulty() == expected).all()
+    assert (run.worlds.difficulty() == expected).all()
 
 
 def test_batch_follows_the_worlds_unless_given():
     recipe = default_controller_recipe("z", "1d")
     assert recipe.fit_batch(seed=3) == recipe.replace(seed=3)
-    assert recipe.fit_batch(worlds=8).batch == 512
-    assert recipe.fit_batch(worlds=100).batch == 800  # an eighth of 6400; a seventh is no whole number
-    assert recipe.fit_batch(worlds=16, batch=512).batch == 512
-    with pytest.raises(ConfigError, match="divisor of worlds x rollout = 1024"):
+    assert recipe.fit_batch(worlds=8).batch == 128
+    assert recipe.fit_batch(worlds=70).batch == 280  # a quarter of 1120; a third is no whole number
+    assert recipe.fit_batch(worlds=16, batch=64).batch == 64
+    with pytest.raises(ConfigError, match="divisor of worlds x rollout = 256"):
         recipe.fit_batch(worlds=16, batch=4096)
     with pytest.raises(ConfigError, match="worlds is 0"):
         recipe.fit_batch(worlds=0)
@@ -132,6 +173,31 @@ def test_speed_limit_in_numpy_and_torch_agree():
     clipped = torch.tensor(actions).clamp(-1, 1)
     np.testing.assert_allclose(limit_speed(clipped, 1.0).numpy(), found, rtol=1e-6)
     np.testing.assert_array_equal(shorten(actions, 0.0), clipped.numpy())
+
+
+def test_rings_are_encoded_in_8_bits_while_training_and_exactly_afterwards(monkeypatch):
+    model = world_model("rings")
+    recipe = default_controller_recipe("z", "rings")
+    assert recipe.precision == "int8"
+    assert default_controller_recipe("z", "1d").precision == "bfloat16"
+    assert learner.make_encoder(default_controller_recipe("z", "1d"), model) is None
+    assert learner.make_encoder(default_controller_recipe("e2e", "rings"), None) is None
+    network = learner.make_network(recipe, model)
+    simulator = Simulator(environment(recipe), 8, seed=1)
+    simulator.reset()
+    scan, robot_state = simulator.observe()
+    exact = learner.make_policy(recipe.replace(precision="float32"), network, model)
+    codes = exact.look(scan, robot_state)[0]
+    if quantized.can_quantize():
+        encoders = [learner.make_encoder(recipe, model) for _ in range(2)]
+        found = [learner.make_policy(recipe, network, model, "", e).look(scan, robot_state)[0] for e in encoders]
+        np.testing.assert_array_equal(*found)  # calibrated on the same worlds: a resume sees the same
+        assert not np.array_equal(found[0], codes)
+        assert np.abs(found[0] - codes).max() < 0.2 * codes[:, :-5].std()
+    monkeypatch.setattr(learner, "can_quantize", lambda: False)
+    assert learner.make_encoder(recipe, model) is None
+    rounded = learner.make_policy(recipe, network, model).look(scan, robot_state)[0]
+    assert 0.0 < np.abs(rounded - codes).max() < 0.1 * codes[:, :-5].std()
 
 
 @pytest.mark.parametrize("features", ["z", "zh"])

@@ -163,7 +163,7 @@ def test_gradients_reach_every_weight_of_v_and_m():
     torch.manual_seed(0)
     v = checkpoint.make("vae", {"lidar": "1d", "z_size": 8}).train()
     vae_loss(
-        v, torch.rand(3, 1080), default_recipe("v", "1d"), 5000, Noise.seeded(0), Counts(3, 0, 3, 0)
+        v, {"obs": torch.rand(3, 1080)}, default_recipe("v", "1d"), 5000, Noise.seeded(0), Counts(3, 0, 3, 0)
     ).total.backward()
     assert unreached(v) == []
     m = checkpoint.make("memory", {"z_size": 4, "h_size": 8}).train()
