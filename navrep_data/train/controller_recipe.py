@@ -14,6 +14,8 @@ VALIDATION_SEEDS = range(5000, 5100)
 """Episodes that selection looks at: never those of the test suite, 1000 to 1199."""
 AUTHORS_SEEDS = range(1000, 1100)
 AUTHORS_HELD_OUT = range(1100, 1200)
+MOST_STD = 0.6
+"""Largest width of the distribution of bounded actions."""
 PRECISIONS = ("int8", "bfloat16", "float32")
 
 
@@ -28,8 +30,8 @@ class ControllerRecipe:
     lidar : str
         ``"rings"`` or ``"1d"``.
     original : bool
-        Whether these are the authors' settings; then the action is a clipped Gaussian without bounds, timeouts count
-        as ends, and selection looks at episodes 1000 to 1099.
+        Whether these are the authors' settings; then the action is a clipped Gaussian without bounds,
+        and selection looks at episodes 1000 to 1099.
     steps : int
         Steps of all worlds together.
     worlds, rollout : int
@@ -42,6 +44,8 @@ class ControllerRecipe:
         PPO's.
     target_kl : float
         An update stops where the policy moved farther; 0 = never.
+    least_std : float
+        Width of the action's distribution that stays at least, so that ways out of dead ends are tried to the end.
     hidden : int
         Units per layer.
     max_speed : float
@@ -53,6 +57,9 @@ class ControllerRecipe:
     progress : float
         Further reward, before the factor, per metre that a step brings the robot nearer to its goal: without it
         standing still is what early training learns, since driving ends in collisions.
+    timeouts_end : bool
+        Whether nothing is expected after a timeout, as in the authors' software, so that waiting for one is a loss;
+        otherwise timeouts are truncations.
     easy_start : bool
         Whether worlds start without humans and obstacles, for the curriculum to add; the authors' start with most.
     precision : str
@@ -82,11 +89,13 @@ class ControllerRecipe:
     value_weight: float = 0.5
     max_grad_norm: float = 0.5
     target_kl: float = 0.03
+    least_std: float = 0.05
     hidden: int = 128
     max_speed: float = 1.0
     physics: str = "consistent"
     reward_scale: float = 0.05
     progress: float = 5.0
+    timeouts_end: bool = False
     easy_start: bool = True
     precision: str = "bfloat16"
     context: str = "newest-32"
@@ -109,6 +118,8 @@ class ControllerRecipe:
                 raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected true or false.")
             if field.type == "float" and (type(value) not in (int, float) or not 0 <= value <= 1e6):
                 raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected a number of at least 0.")
+        if not 0.0 < self.least_std <= MOST_STD:
+            raise ConfigError(f"least_std is {self.least_std}, expected more than 0, and {MOST_STD} at most.")
         if self.worlds * self.rollout % self.batch:
             raise ConfigError(
                 f"batch is {self.batch}, expected a divisor of worlds x rollout = {self.worlds * self.rollout}."
@@ -144,7 +155,7 @@ def original_controller_recipe(features: str, lidar: str, modular: bool = False)
     return ControllerRecipe(
         features, lidar, original=True, steps=100_000_000 if modular else 60_000_000, worlds=6, rollout=128, batch=192,
         epochs=4, lr=2.5e-4, entropy=0.01, target_kl=0.0, hidden=64, max_speed=0.0, physics="original",
-        reward_scale=1.0, progress=0.0, easy_start=False, precision="float32", context="oldest-32",
+        reward_scale=1.0, progress=0.0, timeouts_end=True, easy_start=False, precision="float32", context="oldest-32",
         validate_every=600_000,
     )  # fmt: skip
 

@@ -123,7 +123,7 @@ def make_worlds(
         return TrainingWorlds(
             environment(recipe), make_policy(recipe, network, model, "", encoder), n_worlds, seed=seed,
             first_sequence=first_sequence, max_speed=network.config.max_speed, reward_scale=recipe.reward_scale,
-            progress=recipe.progress, truncate=not recipe.original,
+            progress=recipe.progress, truncate=not recipe.timeouts_end,
         )  # fmt: skip
 
     n_groups = max(1, min(torch.get_num_threads(), recipe.worlds // _WORTH_A_GROUP))
@@ -143,7 +143,9 @@ def make_ppo(recipe: ControllerRecipe, worlds: WorldGroups, network: Controller 
             "features_extractor_class": EndToEndExtractor,
             "features_extractor_kwargs": {"lidar": recipe.lidar},
         }
-    kind = ActorCriticPolicy if network.config.squash == "clip" else BoundedPolicy
+    kind: type[ActorCriticPolicy] = ActorCriticPolicy
+    if network.config.squash != "clip":
+        kind, kwargs["least_std"] = BoundedPolicy, recipe.least_std
     return PPO(
         kind, worlds, learning_rate=recipe.lr, n_steps=recipe.rollout, batch_size=recipe.batch, n_epochs=recipe.epochs,
         gamma=recipe.gamma, gae_lambda=recipe.gae_lambda, clip_range=recipe.clip_range,

@@ -11,11 +11,11 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution, Dis
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor
 
-LEAST_STD, MOST_STD = 0.05, 0.6
+from navrep_data.train.controller_recipe import MOST_STD
 
 
 class BoundedPolicy(ActorCriticPolicy):
-    """A normal distribution whose mean is within (-1, 1) and whose width stays between 0.05 and 0.6.
+    """A normal distribution whose mean is within (-1, 1) and whose width stays between `least_std` and 0.6.
 
     Notes
     -----
@@ -24,13 +24,19 @@ class BoundedPolicy(ActorCriticPolicy):
     """
 
     def __init__(
-        self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], *args: Any, **kwargs: Any
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        *args: Any,
+        least_std: float = 0.05,
+        **kwargs: Any,
     ):
+        self._least = math.log(least_std)
         kwargs.setdefault("log_std_init", math.log(0.4))
         super().__init__(observation_space, action_space, *args, **kwargs)
 
     def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Distribution:
         assert isinstance(self.action_dist, DiagGaussianDistribution)
         mean = torch.tanh(self.action_net(latent_pi))
-        width = self.log_std.clamp(math.log(LEAST_STD), math.log(MOST_STD))
+        width = self.log_std.clamp(self._least, math.log(MOST_STD))
         return self.action_dist.proba_distribution(mean, width)

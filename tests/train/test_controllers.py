@@ -153,6 +153,37 @@ def test_worlds_start_easy_or_hard(easy, expected, few_episodes, tmp_path):
     assert (run.worlds.difficulty() == expected).all()
 
 
+@pytest.mark.parametrize("least", [0.05, 0.3])
+def test_the_width_of_actions_stays_within_its_bounds(least, few_episodes, tmp_path):
+    recipe = default_controller_recipe("z", "1d").replace(**SMALL, least_std=least)
+    model = world_model()
+    network = learner.make_network(recipe, model)
+    worlds = learner.make_worlds(recipe, network, model, None, 0)
+    policy = learner.make_ppo(recipe, worlds, network, "cpu").policy
+    for log_std, expected in ((-9.0, least), (np.log(0.4), 0.4), (9.0, 0.6)):
+        with torch.no_grad():
+            policy.log_std.fill_(log_std)
+            width = policy.get_distribution(torch.zeros(2, policy.observation_space.shape[0])).distribution.stddev
+        np.testing.assert_allclose(width, expected, rtol=1e-5)
+    with pytest.raises(ConfigError, match="least_std is 0"):
+        recipe.replace(least_std=0.0)
+
+
+@pytest.mark.parametrize("end", [False, True])
+def test_timeouts_are_truncations_unless_they_end(end):
+    recipe = default_controller_recipe("z", "1d").replace(**SMALL, timeouts_end=end)
+    model = world_model()
+    worlds = learner.make_worlds(recipe, learner.make_network(recipe, model), model, None, 0)
+    worlds.reset()
+    seen = []
+    for _ in range(180):  # standing still: who is not run into is out of time after 176 steps
+        worlds.step_async(np.zeros((8, 2), np.float32))
+        seen += [info for info in worlds.step_wait()[3] if info.get("event") == "timeout"]
+    assert seen
+    assert all(("TimeLimit.truncated" in info) != end for info in seen)
+    assert original_controller_recipe("z", "1d").timeouts_end
+
+
 def test_batch_follows_the_worlds_unless_given():
     recipe = default_controller_recipe("z", "1d")
     assert recipe.fit_batch(seed=3) == recipe.replace(seed=3)
