@@ -114,7 +114,7 @@ class Recipe:
         M: weight, in the restart loss, of rows whose next row is an episode's last.
     ranges_weight, people_weight : float
         v, joint and transformer: weights of the errors of a linear head on z, thrown away afterwards, that says how
-        near things and people are; see :mod:`navrep_data.train.cues`. 0 = not asked; people are only asked for where
+        near things and people are; see ``navrep_data.train.cues``. 0 = not asked; people are only asked for where
         the dataset has a `humans` column.
     precision : str
         ``"bfloat16"`` or ``"float32"``, of V's passes; weights, memory and losses are float32.
