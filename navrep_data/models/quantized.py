@@ -4,8 +4,8 @@ Notes
 -----
 Rings hold 0, 1/2 and 1, which 8 bits represent exactly, so only weights and the maps between layers are rounded: one
 scale per output channel for weights, one per map, from observations that it is calibrated on. Features move by a
-hundredth of their spread; with bfloat16 by a few thousandths. benchmarks/training.py measures the speed: 1.7 times that
-of bfloat16 on one core of an AMD EPYC without matrix units.
+hundredth of their spread; with bfloat16 by a few thousandths. benchmarks/training.py measures the speed: 1.8 times that
+of bfloat16 on an AMD EPYC without matrix units.
 """
 
 from __future__ import annotations
