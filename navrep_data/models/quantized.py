@@ -1,4 +1,4 @@
-"""V's encoder in 8 bits: what controllers are trained through, where most of the time goes into encoding.
+"""V's encoder in 8 bits: what controllers are trained through, since encoding takes much of the time.
 
 Notes
 -----
