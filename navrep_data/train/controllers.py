@@ -168,7 +168,6 @@ class _Run(BaseCallback):
         self.ppo.num_timesteps = self.at.step
         self.logger_file: Logger | None = None
         self.spent, self.began, self.first = 0.0, 0.0, self.at.step
-        self.threads = torch.get_num_threads()
         self.stop_at = recipe.steps
         self.bar: Any = None
         if model is not None and not (out / PARTS).exists():
@@ -223,17 +222,10 @@ class _Run(BaseCallback):
 
     def _learn(self, steps: int) -> None:
         try:
-            self._use_threads(learning=True)
             self.ppo.learn(steps, callback=self, reset_num_timesteps=False)
         except ValueError:  # torch's distributions refuse what is not finite
             self._check_finite()
             raise
-        finally:
-            self._use_threads(learning=False)
-
-    def _use_threads(self, learning: bool) -> None:
-        """Leave the cores to the groups of worlds: updates are so small that more threads make them slower."""
-        torch.set_num_threads(1 if learning and len(self.worlds.groups) > 1 else self.threads)
 
     def _check_finite(self) -> None:
         """Raise where an update left weights that are not finite: nothing of that is saved."""
@@ -263,7 +255,6 @@ class _Run(BaseCallback):
         self._log(now)
         if due:
             self._checkpoint(validate=True)
-            self._use_threads(learning=True)
             self._start_worlds()
 
     def _seed(self) -> None:
@@ -305,7 +296,6 @@ class _Run(BaseCallback):
 
     def _checkpoint(self, validate: bool) -> None:
         self._check_finite()
-        self._use_threads(learning=False)
         clock = time.perf_counter()
         self.spent += clock - self.began
         self.at.step = self.ppo.num_timesteps

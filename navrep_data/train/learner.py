@@ -20,6 +20,7 @@ from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE
 from navrep_data.sim import Simulator
 from navrep_data.train.controller_recipe import ControllerRecipe, environment
 from navrep_data.train.encode import vae_of
+from navrep_data.train.ppo import GroupedPPO
 from navrep_data.train.ppo_policy import BoundedPolicy
 from navrep_data.train.worlds import TrainingWorlds, WorldGroups
 from navrep_data.zoo.policy import Policy
@@ -135,7 +136,7 @@ def make_ppo(recipe: ControllerRecipe, worlds: WorldGroups, network: Controller 
     kwargs: dict[str, Any] = {
         "net_arch": {"pi": [network.config.n_hidden] * 2, "vf": [network.config.n_hidden] * 2},
         "activation_fn": nn.Tanh,
-        "optimizer_kwargs": {"eps": 1e-5},
+        "optimizer_kwargs": {"eps": 1e-5, "fused": True},
     }
     if isinstance(network, EndToEnd):
         kwargs |= {
@@ -144,9 +145,11 @@ def make_ppo(recipe: ControllerRecipe, worlds: WorldGroups, network: Controller 
             "features_extractor_kwargs": {"lidar": recipe.lidar},
         }
     kind: type[ActorCriticPolicy] = ActorCriticPolicy
+    algorithm = PPO
     if network.config.squash != "clip":
         kind, kwargs["least_std"] = BoundedPolicy, recipe.least_std
-    return PPO(
+        algorithm = GroupedPPO
+    return algorithm(
         kind, worlds, learning_rate=recipe.lr, n_steps=recipe.rollout, batch_size=recipe.batch, n_epochs=recipe.epochs,
         gamma=recipe.gamma, gae_lambda=recipe.gae_lambda, clip_range=recipe.clip_range,
         clip_range_vf=recipe.clip_range if recipe.original else None, ent_coef=recipe.entropy,

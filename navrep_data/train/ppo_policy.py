@@ -35,8 +35,15 @@ class BoundedPolicy(ActorCriticPolicy):
         kwargs.setdefault("log_std_init", math.log(0.4))
         super().__init__(observation_space, action_space, *args, **kwargs)
 
+    def heads(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return means (N, A), log widths (A,) and values (N,) of observations (N, F)."""
+        latent_pi, latent_vf = self.mlp_extractor(self.extract_features(obs))
+        mean, log_width = self._distribution(latent_pi)
+        return mean, log_width, self.value_net(latent_vf).squeeze(1)
+
+    def _distribution(self, latent_pi: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.tanh(self.action_net(latent_pi)), self.log_std.clamp(self._least, math.log(MOST_STD))
+
     def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Distribution:
         assert isinstance(self.action_dist, DiagGaussianDistribution)
-        mean = torch.tanh(self.action_net(latent_pi))
-        width = self.log_std.clamp(self._least, math.log(MOST_STD))
-        return self.action_dist.proba_distribution(mean, width)
+        return self.action_dist.proba_distribution(*self._distribution(latent_pi))

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -59,6 +59,31 @@ class _Batch(VecEnv):
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """Return False for each world asked for: the statistics are those of the simulator."""
         return [False] * len(list(self._get_indices(indices)))
+
+
+class Stepped(NamedTuple):
+    """What a step of W worlds brought.
+
+    Attributes
+    ----------
+    obs : ndarray of shape (W, F)
+        Features after it; of the next episode where one ended.
+    rewards, done : ndarray of shape (W,)
+        Scaled rewards, and whether an episode ended.
+    finished : tuple of ndarray
+        Of the episodes that ended: worlds, events, sums of the simulator's rewards, lengths in steps.
+    cut : ndarray of int
+        Worlds whose episode was truncated.
+    ends : ndarray of shape (len(cut), F)
+        The features they ended with.
+    """
+
+    obs: F32
+    rewards: F32
+    done: NDArray[np.bool_]
+    finished: tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.float64], NDArray[np.int64]]
+    cut: NDArray[np.int64]
+    ends: F32
 
 
 class TrainingWorlds(_Batch):
@@ -149,47 +174,54 @@ class TrainingWorlds(_Batch):
 
     def step_wait(self) -> tuple[F32, F32, NDArray[np.bool_], list[dict[str, Any]]]:
         """Step all worlds; those whose episode ends start the next one."""
+        before = self._last
+        found = self.advance(self._actions)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        now = round(time.time() - self._start, 6)
+        for world, event, total, length in zip(*found.finished, strict=True):
+            infos[world]["episode"] = {"r": float(total), "l": int(length), "t": now}
+            infos[world]["event"] = Event(int(event)).label
+            # stable-baselines3 wants one for every end, and looks at those of truncated episodes only
+            infos[world]["terminal_observation"] = before[world]
+        for world, features in zip(found.cut, found.ends, strict=True):
+            infos[world]["terminal_observation"] = features
+            infos[world]["TimeLimit.truncated"] = True
+        return found.obs, found.rewards, found.done, infos
+
+    def advance(self, actions: F32) -> Stepped:
+        """Step all worlds by actions (W, 2); those whose episode ends start the next one."""
         began = time.perf_counter()
-        velocity = shorten(self._actions, self.max_speed)
+        velocity = shorten(actions, self.max_speed)
         commands = np.zeros((self.num_envs, ACTION_SIZE))
         commands[:, :N_ACTIONS] = velocity
         rewards, events = self.simulator.step(commands)
         done = events != Event.NONE
         self._returns += rewards
         self._lengths += 1
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        over = np.flatnonzero(done)
+        finished = over, events[over], self._returns[over], self._lengths[over]
         cut = np.flatnonzero(events == Event.TIMEOUT) if self.truncate else np.zeros(0, np.int64)
-        ends = self.simulator.observe() if len(cut) else None
-        if done.any():
-            self._finish(np.flatnonzero(done), events, infos)
+        ends = np.zeros((0, self._last.shape[1]), np.float32)
+        last_seen = self.simulator.observe() if len(cut) else None
+        if len(over):
+            self.outcomes += [Event(int(event)) for event in events[over]]
+            self._returns[over], self._lengths[over] = 0.0, 0
             self.simulator.reset(done)
         scan, state = self.simulator.observe()
         to_go = _distance(state)
         shaped = rewards + self.progress * np.where(done, 0.0, self._to_go - to_go)
         self._to_go = to_go
         middle = time.perf_counter()
-        if ends is not None:
-            for world, features in zip(cut, self._ends(ends[0][cut], ends[1][cut], self._last[cut]), strict=True):
-                infos[world]["terminal_observation"] = features
-                infos[world]["TimeLimit.truncated"] = True
+        if last_seen is not None:
+            ends = self._ends(last_seen[0][cut], last_seen[1][cut], self._last[cut])
         self.policy.observe(velocity)
-        if done.any():
+        if len(over):
             self.policy.reset(mask=done)
         self._last = self.policy.encode(scan, state)
         self.seconds["simulate"] += middle - began
         self.seconds["encode"] += time.perf_counter() - middle
-        return self._last.copy(), (shaped * self.reward_scale).astype(np.float32), done, infos
-
-    def _finish(self, worlds: NDArray[np.int64], events: NDArray[np.uint8], infos: list[dict[str, Any]]) -> None:
-        now = round(time.time() - self._start, 6)
-        for world in worlds:
-            event = Event(int(events[world]))
-            self.outcomes.append(event)
-            infos[world]["episode"] = {"r": float(self._returns[world]), "l": int(self._lengths[world]), "t": now}
-            infos[world]["event"] = event.label
-            # stable-baselines3 wants one for every end, and looks at those of truncated episodes only
-            infos[world]["terminal_observation"] = self._last[world]
-        self._returns[worlds], self._lengths[worlds] = 0.0, 0
+        scaled = (shaped * self.reward_scale).astype(np.float32)
+        return Stepped(self._last.copy(), scaled, done, finished, cut, ends)
 
     def _ends(self, scan: F32, state: F32, before: F32) -> F32:
         """Return the observations that truncated episodes end with."""
@@ -229,15 +261,21 @@ class WorldGroups(_Batch):
         first = self.groups[0]
         super().__init__(n_worlds, first.observation_space, first.action_space)
 
-    def _each(self, work: Callable[[TrainingWorlds, slice], Any]) -> list[Any]:
-        """Do something with every group and its worlds' slice, side by side."""
+    def each(self, work: Callable[[TrainingWorlds, slice], Any]) -> list[Any]:
+        """Do something with every group and its worlds' slice, side by side; each on one thread of torch's."""
         if len(self.groups) == 1:
             return [work(self.groups[0], self._slices[0])]
-        return list(self._pool.map(work, self.groups, self._slices))
+        threads = torch.get_num_threads()
+        # of all threads: matrix products have one number for the whole process
+        torch.set_num_threads(1)
+        try:
+            return list(self._pool.map(work, self.groups, self._slices))
+        finally:
+            torch.set_num_threads(threads)
 
     def reset(self) -> F32:
         """Start an episode in every world."""
-        return np.concatenate(self._each(lambda group, _: group.reset()))
+        return np.concatenate(self.each(lambda group, _: group.reset()))
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Take the actions of the next step."""
@@ -246,13 +284,13 @@ class WorldGroups(_Batch):
 
     def step_wait(self) -> tuple[F32, F32, NDArray[np.bool_], list[dict[str, Any]]]:
         """Step all worlds; those whose episode ends start the next one."""
-        found = self._each(lambda group, _: group.step_wait())
+        found = self.each(lambda group, _: group.step_wait())
         seen, rewards, done = (np.concatenate([one[k] for one in found]) for k in range(3))
         return seen, rewards, done, [info for one in found for info in one[3]]
 
     def restart(self, seed: int, difficulty: NDArray[np.int64]) -> None:
         """Go on in worlds from another stream, as difficult as given; call :meth:`reset` next."""
-        self._each(lambda group, worlds: group.restart(seed, difficulty[worlds]))
+        self.each(lambda group, worlds: group.restart(seed, difficulty[worlds]))
 
     def difficulty(self) -> NDArray[np.int64]:
         """Return the present numbers of humans and obstacles (W, 2)."""

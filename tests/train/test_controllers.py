@@ -310,14 +310,14 @@ def test_a_resume_gives_the_same_weights(features, few_episodes, tmp_path):
 
 @pytest.mark.slow
 def test_nan_stops_and_keeps_the_last_good_checkpoint(few_episodes, tmp_path, monkeypatch):
-    step_wait, steps = TrainingWorlds.step_wait, []
+    advance, steps = TrainingWorlds.advance, []
 
-    def poisoned(self):
-        obs, rewards, done, infos = step_wait(self)
+    def poisoned(self, actions):
+        found = advance(self, actions)
         steps.append(0)
-        return obs, rewards * (np.float32("nan") if len(steps) > 12 else 1), done, infos
+        return found._replace(rewards=found.rewards * (np.float32("nan") if len(steps) > 12 else 1))
 
-    monkeypatch.setattr(TrainingWorlds, "step_wait", poisoned)
+    monkeypatch.setattr(TrainingWorlds, "advance", poisoned)
     recipe = default_controller_recipe("z", "1d").replace(**SMALL)
     with pytest.raises(TrainingError, match=r"Weights are NaN after 128 steps.*step-00000064; lower lr") as error:
         controllers.train_controller(recipe, tmp_path / "c", model=world_model())
