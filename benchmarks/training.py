@@ -3,10 +3,10 @@
     python benchmarks/training.py [--only transformer_rings ...] [--json]
 
 World models: one training step on frames in memory (forward, backward, AdamW), ours against the layers as they are
-written (float32, torch's transposed convolutions, everything decoded), in turns (A B A B ...). The encoder of rings in
-8 bits, as controllers are trained through it, likewise against itself in bfloat16. Controllers: whole PPO
-iterations (rollout in 256 worlds, encoding, update), as the default recipe has them. Wall time, with as many threads
-as torch takes.
+written (float32, torch's transposed convolutions, everything decoded), in turns (A B A B ...). Encoders in 8 bits, as
+controllers are trained through them, likewise against themselves in bfloat16. Controllers: whole PPO iterations
+(rollout in 256 worlds, encoding, update), as the default recipe has them. Wall time, with as many threads as torch
+takes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from harness import in_turns, machine, ratio, spread
 
 WORLD_MODELS = ("transformer_rings", "joint_rings", "transformer_1d", "joint_1d")
 CONTROLLERS = ("rings_z", "1d_z")
-ENCODER = "encoder_rings"
+ENCODERS = ("encoder_rings", "encoder_1d")
 MUST = {"transformer_rings": 900, "rings_z": 10_000, "1d_z": 18_000}
 AIMS = {"transformer_rings": 1_300, "rings_z": 14_000, "1d_z": 25_000}
 WINDOWS = 32
@@ -92,7 +92,7 @@ def training_step(name: str, plain: bool) -> Callable[[], float]:
     return work
 
 
-def encoders() -> list[Callable[[], float]]:
+def encoders(lidar: str) -> list[Callable[[], float]]:
     """Return work that encodes 256 scans of training worlds: in 8 bits, and in bfloat16."""
     import torch
 
@@ -100,10 +100,10 @@ def encoders() -> list[Callable[[], float]]:
     from navrep_data.sim import Simulator, make_config
 
     torch.manual_seed(0)
-    vae = VAE(VAEConfig("rings", 64)).eval()
+    vae = VAE(VAEConfig(lidar, 64)).eval()
     simulator = Simulator(make_config("navrep-train"), 256, seed=0)
     simulator.reset()
-    obs = observation_from_scan(simulator.observe()[0], "rings")
+    obs = observation_from_scan(simulator.observe()[0], lidar)
 
     def work(encode: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[], float]:
         return lambda: float(len(encode(obs)))
@@ -147,7 +147,11 @@ def measure(name: str, repeats: int, seconds: float) -> dict[str, Any]:
     if name in CONTROLLERS:
         row = controller(name, repeats * seconds)
     else:
-        both = encoders() if name == ENCODER else [training_step(name, False), training_step(name, True)]
+        both = (
+            encoders(name.split("_")[1])
+            if name in ENCODERS
+            else [training_step(name, False), training_step(name, True)]
+        )
         ours, other = in_turns(both, repeats, seconds)
         mine = spread(ours.wall)
         row = {
@@ -159,7 +163,7 @@ def measure(name: str, repeats: int, seconds: float) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", default=[*WORLD_MODELS, ENCODER, *CONTROLLERS], metavar="NAME")
+    parser.add_argument("--only", nargs="+", default=[*WORLD_MODELS, *ENCODERS, *CONTROLLERS], metavar="NAME")
     parser.add_argument("--repeats", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--threads", type=int)

@@ -146,8 +146,7 @@ def default_controller_recipe(features: str, lidar: str) -> ControllerRecipe:
     """Return our settings; end to end with fewer worlds, since its rollouts hold whole observations."""
     if features == "e2e":
         return ControllerRecipe(features, lidar, worlds=128, rollout=64, batch=1024, lr=3e-4, hidden=64)
-    # ranges lose too much in 8 bits: 25 m in steps of 10 cm; rings are exact
-    return ControllerRecipe(features, lidar, precision="int8" if lidar == "rings" else "bfloat16")
+    return ControllerRecipe(features, lidar, precision="int8")
 
 
 def original_controller_recipe(features: str, lidar: str, modular: bool = False) -> ControllerRecipe:
