@@ -59,7 +59,7 @@ SECONDS ?= 600
 fuzz: $(STAMP)  ## Fuzz every reader of files from outside for SECONDS=600 (CI: 60).
 	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(FUZZ_ARGS)
 
-BENCHMARKS := run zoo envs scale
+BENCHMARKS := run zoo envs scale training
 
 bench: $(STAMP)  ## Measure speed and size; writes benchmarks/RESULTS.md.
 	failed=0; for script in $(BENCHMARKS); do $(BIN)/python benchmarks/$$script.py --write || failed=1; done; exit $$failed

@@ -1,6 +1,6 @@
 """Frames per second of world-model training and steps per second of controller training.
 
-    python benchmarks/training.py [--only transformer_rings ...] [--json]
+    python benchmarks/training.py [--only transformer_rings ...] [--write] [--json]
 
 World models: one training step on frames in memory (forward, backward, AdamW), ours against the layers as they are
 written (float32, torch's transposed convolutions, everything decoded), in turns (A B A B ...). Encoders in 8 bits, as
@@ -19,6 +19,7 @@ from collections.abc import Callable
 from typing import Any
 
 from harness import in_turns, machine, ratio, spread
+from report import describe, number, table, write_section
 
 WORLD_MODELS = ("transformer_rings", "joint_rings", "transformer_1d", "joint_1d")
 CONTROLLERS = ("rings_z", "1d_z")
@@ -161,35 +162,61 @@ def measure(name: str, repeats: int, seconds: float) -> dict[str, Any]:
     return {"name": name, "must": MUST.get(name), "aim": AIMS.get(name), **row}
 
 
-def main() -> None:
+HEADER = ("training", "per second", "spread", "must", "aim", "verdict", "compared with", "ratio")
+INTRODUCTION = """## Training
+
+{machine}
+
+World models: frames per second of a training step of 32 windows, against the layers as they are written. Encoders in
+8 bits: frames per second, against bfloat16. Controllers: steps per second of whole PPO iterations in 256 worlds (rollout,
+encoding, update). {threads} threads, wall time, medians over turns.
+"""
+
+
+def verdict(row: dict[str, Any]) -> str:
+    """Return whether a row reaches what it must."""
+    if row["must"] is None:
+        return "-"
+    return "pass" if row["value"] >= row["must"] else "FAIL"
+
+
+def show(row: dict[str, Any]) -> list[str]:
+    """Return a measured row as the cells of the table."""
+    other = [number(row["as_written"]), f"{row['ratio']:.2f}"] if "ratio" in row else ["-", "-"]
+    shares = "".join(f", {part} {100 * share:.0f} %" for part, share in row.get("shares", {}).items())
+    return [
+        row["name"] + shares, number(row["value"]), f"{number(row['low'])} to {number(row['high'])}",
+        number(row["must"]), number(row["aim"]), verdict(row), *other,
+    ]  # fmt: skip
+
+
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", default=[*WORLD_MODELS, *ENCODERS, *CONTROLLERS], metavar="NAME")
     parser.add_argument("--repeats", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--threads", type=int)
+    parser.add_argument("--write", action="store_true", help="update benchmarks/RESULTS.md")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     import torch
 
     if args.threads:
         torch.set_num_threads(args.threads)
-    rows = []
+    where, rows = machine(), []
     for name in args.only:
         print(f"measuring {name} ...", file=sys.stderr, flush=True)
         rows.append(measure(name, args.repeats, args.seconds))
     if args.json:
-        print(json.dumps({"machine": machine(), "threads": torch.get_num_threads(), "rows": rows}))
-        return
-    print("| training | per second | spread | must | aim | layers as written | ratio |")
-    print("|---|---|---|---|---|---|---|")
-    for r in rows:
-        written = f"{r['as_written']:,.0f} | {r['ratio']:.2f}" if "ratio" in r else "- | -"
-        shares = "".join(f", {part} {100 * share:.0f} %" for part, share in r.get("shares", {}).items())
-        print(
-            f"| {r['name']}{shares} | {r['value']:,.0f} | {r['low']:,.0f} to {r['high']:,.0f} | {r['must'] or '-'} | "
-            f"{r['aim'] or '-'} | {written} |"
-        )
+        print(json.dumps({"machine": where, "threads": torch.get_num_threads(), "rows": rows}))
+    else:
+        text = INTRODUCTION.format(machine=describe(where), threads=torch.get_num_threads())
+        text += "\n" + table(HEADER, map(show, rows))
+        print(text)
+        if args.write:
+            write_section("training.py", text)
+    return int(any(verdict(row) == "FAIL" for row in rows))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
