@@ -168,8 +168,8 @@ INTRODUCTION = """## Training
 {machine}
 
 World models: frames per second of a training step of 32 windows, against the layers as they are written. Encoders in
-8 bits: frames per second, against bfloat16. Controllers: steps per second of whole PPO iterations in 256 worlds (rollout,
-encoding, update). {threads} threads, wall time, medians over turns.
+8 bits: frames per second, against bfloat16. Controllers: steps per second of whole PPO iterations in 256 worlds
+(rollout, encoding, update). {threads} threads, wall time, medians over turns.
 """
 
 
