@@ -224,23 +224,19 @@ class Recipe:
 
 def default_recipe(model: str, lidar: str) -> Recipe:
     """Return the settings that we find better than the authors'; see docs/training.md for what shows it."""
-    mean = "cross_entropy" if lidar == "rings" else "squared"
-    match model:
-        case "v":
-            return Recipe(
-                model, lidar, z_size=32, batch=256, micro_batch=256, window=1, stride=1, reconstruction=mean,
-                reconstruct_share=1.0, kl_weight=1e-4 if lidar == "rings" else 1e-5,
-            )  # fmt: skip
-        case "m":
-            return Recipe(
-                model, lidar, z_size=32, h_size=512, batch=64, micro_batch=64, window=64, stride=64, kl_weight=0.0,
-                goal_scale=25.0, ranges_weight=0.0, people_weight=0.0,
-            )  # fmt: skip
-        case "joint":
-            return Recipe(
-                model, lidar, z_size=32, h_size=64, reconstruction=mean, kl_weight=1e-4 if lidar == "rings" else 1e-5
-            )
-    return Recipe(model, lidar, reconstruction=mean, kl_weight=1e-4 if lidar == "rings" else 1e-5)
+    if model == "m":
+        return Recipe(
+            model, lidar, h_size=512, batch=64, micro_batch=64, window=64, stride=64, kl_weight=0.0, goal_scale=25.0,
+            ranges_weight=0.0, people_weight=0.0,
+        )  # fmt: skip
+    recipe = Recipe(model, lidar)
+    if lidar == "1d":  # squared errors of ranges are a hundredth of the cross entropy of cells
+        recipe = recipe.replace(
+            reconstruction="squared", kl_weight=1e-5, ranges_weight=0.001, people_weight=0.003
+        )  # fmt: skip
+    if model == "v":
+        return recipe.replace(batch=256, micro_batch=256, window=1, stride=1, reconstruct_share=1.0)
+    return recipe
 
 
 def original_recipe(model: str, lidar: str) -> Recipe:
