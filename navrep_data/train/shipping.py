@@ -179,8 +179,9 @@ def _recipe(
     used = training.metadata["recipe"]
     earlier = [t.metadata["recipe"] for t in before]
     modular = training.policy is None and training.model is not None and training.model.config.kind == "modular"
-    # V and M of modular models are two trainings of one recipe; others may have been trained in stages
-    settings = {"v": earlier[0], "m": used} if modular and earlier else used
+    settings = used
+    if modular and earlier:  # V, the last one before, and M are two trainings of one recipe
+        settings = {"v": earlier.pop(), "m": used}
     if not commands and found.get("settings") != settings:
         old = found.get("settings") or {}
         other = sorted(k for k in {*old, *settings} if old.get(k) != settings.get(k))
@@ -193,7 +194,7 @@ def _recipe(
         **found,
         "commands": list(commands) or found["commands"],
         "settings": settings,
-        **({"stages_before": earlier} if earlier and not modular else {}),
+        **({"stages_before": earlier} if earlier else {}),
         "wall_time_s": round(sum(times)),
         "machine": training.metadata.get("machine"),
         "notes": "Commands in order; settings are those that the training command takes from them. Seeds fixed. The "

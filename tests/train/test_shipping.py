@@ -150,6 +150,19 @@ def test_stages_before_count(trained, package, dataset):
     assert "stages_before" not in alone
 
 
+def test_the_last_v_before_an_m_is_part_of_its_settings(tmp_path):
+    def stage(seed, model=None):
+        recipe = default_recipe("m" if model else "v", "1d").replace(seed=seed).to_dict()
+        return shipping._Training(tmp_path, model, None, {"recipe": recipe}, 10, 2.0)
+
+    joined = checkpoint.make("modular", {"lidar": "1d", "z_size": 8, "h_size": 8})
+    stages = [stage(1), stage(2)]
+    found = shipping._recipe(tmp_path / "none.json", "modular_1d", stage(3, joined), ["..."], stages)
+    assert (found["settings"]["v"]["seed"], found["settings"]["m"]["seed"]) == (2, 3)
+    assert [one["seed"] for one in found["stages_before"]] == [1]
+    assert found["wall_time_s"] == 6
+
+
 def test_a_v_alone_may_be_the_stage_before(trained, package, dataset, tmp_path):
     settings = default_recipe("v", "1d").replace(steps=1, batch=8, micro_batch=8, validate_batches=1)
     train_world_model(settings, dataset, tmp_path / "v", preload=True)
