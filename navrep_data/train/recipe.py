@@ -234,6 +234,8 @@ def default_recipe(model: str, lidar: str) -> Recipe:
         recipe = recipe.replace(
             reconstruction="squared", kl_weight=1e-5, ranges_weight=0.001, people_weight=0.003
         )  # fmt: skip
+    if model == "joint":  # whose LSTM holds two numbers for each of z
+        return recipe.replace(h_size=2 * recipe.z_size)
     if model == "v":
         return recipe.replace(batch=256, micro_batch=256, window=1, stride=1, reconstruct_share=1.0)
     return recipe

@@ -403,13 +403,15 @@ def machine(device: torch.device) -> dict[str, Any]:
 
 
 def _start_from(model: nn.Module, init: nn.Module) -> None:
-    """Copy weights of a network of the same kind; of a V alone, a world model takes its V.
+    """Copy weights of a network of the same kind; of a V alone, or a world model of another kind, its V.
 
     Raises
     ------
     CheckpointError, ConfigError
         If it is of another kind, or fed other actions.
     """
+    if isinstance(init, WorldModel) and isinstance(model, WorldModel) and type(init) is not type(model):
+        init = init.vae
     if isinstance(init, VAE) and isinstance(model, WorldModel):
         if model.vae.config != init.config:
             raise CheckpointError(

@@ -227,6 +227,13 @@ def test_world_models_start_from_a_v(model, dataset, tmp_path):
     with pytest.raises(CheckpointError, match="--set z_size=16") as error:
         train(recipe(model, "1d", steps=1, z_size=16, h_size=32), dataset, tmp_path / "other", init=start)
     one_line(error)
+    other = recipe("joint" if model == "transformer" else "transformer", "1d", steps=1, z_size=8, h_size=16, lr=0.0)
+    second = checkpoint.load(
+        train(other.replace(lr_end=0.0), dataset, tmp_path / "second", init=done).out
+    )  # another kind: its V
+    assert type(second) is not type(done)
+    for name, value in start.state_dict().items():
+        assert torch.equal(second.vae.state_dict()[name], value)
 
 
 @pytest.mark.parametrize(
