@@ -27,6 +27,9 @@ from navrep_data.train.cues import Cues
 from navrep_data.train.recipe import Recipe
 
 _LOG_ROOT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
+_DREAMING_WINDOWS = 0.5
+# Rows that were expected from rows that were expected from rows ...: so long are the dreams that are learned from.
+_DREAM_PASSES = 3
 
 
 @dataclass
@@ -150,8 +153,11 @@ def world_model_loss(
     z[mask] = z_rows
     state = None if recipe.original and noise is not None else _zero_state(model, z)
     memory_noise = None if noise is None else Noise(noise.generator, recipe.dropout)
-    h, _ = model.hidden(z, batch["goal"], batch["action"], memory_noise, state)
-    next_z, next_goal = model.heads(z, batch["goal"], h)
+    fed_z, fed_goal = z, batch["goal"]
+    if noise is not None and recipe.dream_share > 0.0:
+        fed_z, fed_goal = _partly_dreamt(model, z, batch, recipe, noise, state)
+    h, _ = model.hidden(fed_z, fed_goal, batch["action"], memory_noise, state)
+    next_z, next_goal = model.heads(fed_z, fed_goal, h)
     rec_at, pred_at = mask & batch["reconstruct"], next_mask & batch["predict"]
     logits = passes.decode_logits(model.vae, torch.cat([z[rec_at], next_z[pred_at]]), dtype)
     wanted = torch.cat([batch["obs"][rec_at[mask]], batch["next_obs"][pred_at[next_mask]]])
@@ -167,6 +173,29 @@ def world_model_loss(
     asked, found = cue_loss(cues, mu_rows, batch, recipe, counts)
     total = rec + pred + goal + kl_weight(recipe, step) * kl_cost + asked
     return Terms(total, {**{name: float(value.detach()) for name, value in parts.items()}, **found})
+
+
+def _partly_dreamt(
+    model: WorldModel, z: Tensor, batch: dict[str, Tensor], recipe: Recipe, noise: Noise, state: LSTMState | None
+) -> tuple[Tensor, Tensor]:
+    """Return z and goals whose rows are partly what the model itself expected of them.
+
+    A dream is fed its own predictions: a memory that has only seen real rows drifts away from them within a few steps.
+    The other half of the windows stays real, so that what follows real rows is learned as before.
+    """
+    mask = batch["mask"]
+    draw = torch.rand(mask.shape[0], mask.shape[1] + 1, generator=noise.generator, device=z.device)
+    chosen = mask & (draw[:, :1] < _DREAMING_WINDOWS) & (draw[:, 1:] < recipe.dream_share)
+    chosen[:, 0] = False
+    fed_z, fed_goal = z, batch["goal"]
+    with torch.no_grad():
+        for _ in range(_DREAM_PASSES):
+            h, _ = model.hidden(fed_z, fed_goal, batch["action"], None, state)
+            ahead = model.heads(fed_z, fed_goal, h)
+            before = [torch.cat([x[:, :1], x[:, :-1]], 1) for x in ahead]
+            fed_z = torch.where(chosen[..., None], before[0], z.detach())
+            fed_goal = torch.where(chosen[..., None], before[1], batch["goal"])
+    return torch.where(chosen[..., None], fed_z, z), fed_goal
 
 
 def _zero_state(model: WorldModel, z: Tensor) -> LSTMState | None:

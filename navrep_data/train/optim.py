@@ -32,7 +32,7 @@ def decaying(model: nn.Module, rule: str) -> set[str]:
 
 def make_optimizer(model: nn.Module, recipe: Recipe) -> torch.optim.Optimizer:
     """Return AdamW, or Adam where nothing decays, with the recipe's groups."""
-    names = dict(model.named_parameters())
+    names = {name: p for name, p in model.named_parameters() if p.requires_grad}
     decay = decaying(model, recipe.decay) if recipe.weight_decay > 0 else set()
     groups = [
         {"params": [p for n, p in names.items() if n in decay], "weight_decay": recipe.weight_decay},

@@ -40,6 +40,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "dropout": (0.0, 0.9),
     "reconstruct_share": (0.01, 1.0),
     "predict_share": (0.01, 1.0),
+    "dream_share": (0.0, 1.0),
     "restart_factor": (0.0, 1000.0),
     "ranges_weight": (0.0, 100.0),
     "people_weight": (0.0, 100.0),
@@ -110,6 +111,12 @@ class Recipe:
         In the memories of joint and transformer.
     reconstruct_share, predict_share : float
         Share of the rows, drawn anew every step, whose reconstruction and prediction are decoded and compared.
+    dream_share : float
+        Joint and transformer: share of the rows of every second window, drawn anew every step, that the memory is fed
+        as it expected them itself instead of as they were, so that dreams stay with what it knows. 0 = none.
+    freeze_v : bool
+        Joint and transformer: V stays as ``--init`` gives it, so that controllers that see through it stay valid; only
+        the memory learns.
     restart_factor : float
         M: weight, in the restart loss, of rows whose next row is an episode's last.
     ranges_weight, people_weight : float
@@ -155,6 +162,8 @@ class Recipe:
     dropout: float = 0.0
     reconstruct_share: float = 0.25
     predict_share: float = 0.5
+    dream_share: float = 0.0
+    freeze_v: bool = False
     restart_factor: float = 10.0
     ranges_weight: float = 0.05
     people_weight: float = 0.1
@@ -193,6 +202,11 @@ class Recipe:
             if field.type in ("int", "float") and not low <= number <= high:
                 raise ConfigError(f"{field.name} of a recipe is {value}, expected {low:g} to {high:g}.")
 
+        if self.freeze_v and self.model not in ("joint", "transformer"):
+            raise ConfigError(
+                f"freeze_v is for joint and transformer, this is a recipe for {self.model}: leave it out."
+            )
+
     def replace(self, **changes: Any) -> Recipe:
         """Return a copy with some fields changed; None means unchanged."""
         return dataclasses.replace(self, **{name: value for name, value in changes.items() if value is not None})
@@ -229,7 +243,7 @@ def default_recipe(model: str, lidar: str) -> Recipe:
             model, lidar, h_size=512, batch=64, micro_batch=64, window=64, stride=64, kl_weight=0.0, goal_scale=25.0,
             ranges_weight=0.0, people_weight=0.0,
         )  # fmt: skip
-    recipe = Recipe(model, lidar)
+    recipe = Recipe(model, lidar, dream_share=0.0 if model == "v" else 0.5)
     if lidar == "1d":  # squared errors of ranges are a hundredth of the cross entropy of cells
         recipe = recipe.replace(
             reconstruction="squared", kl_weight=1e-5, ranges_weight=0.001, people_weight=0.003

@@ -110,7 +110,7 @@ class WorldModelTask:
         # rows that are decoded without loss of any kind would be waste where all are wanted
         batch = {
             **batch,
-            "reconstruct": shares[0] < recipe.reconstruct_share,
+            "reconstruct": shares[0] < (0.0 if recipe.freeze_v else recipe.reconstruct_share),
             "predict": shares[1] < recipe.predict_share,
         }
         counts = Counts(

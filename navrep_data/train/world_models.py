@@ -226,6 +226,10 @@ class _Loop:
         self.model = make_model(recipe)
         if init is not None:
             _start_from(self.model, init)
+        if recipe.freeze_v:
+            if init is None and state.last_folder(out) is None:
+                raise ConfigError("freeze_v keeps V as --init gives it, but there is none: name a V or a world model.")
+            self.model.vae.requires_grad_(False)
         self.model.to(device)
         self.cues = Cues(recipe.z_size, recipe.lidar).to(device) if cues_wanted(recipe) else None
         # all that is optimised; the head for cues is part of a checkpoint's state, not of its weights

@@ -17,6 +17,8 @@ from navrep_data.models import (
 from navrep_data.train import default_recipe, original_recipe
 from navrep_data.train.losses import (
     Counts,
+    _partly_dreamt,
+    _zero_state,
     divergence,
     memory_loss,
     mixture_nll,
@@ -142,6 +144,53 @@ def test_gradients_reach_every_weight_of_a_world_model(kind, original):
     batch = part(batch_of(2, 4, [4, 4]), 0, 2)
     world_model_loss(model, batch, recipe, 5000, Noise.seeded(0), Counts(8, 6, 8, 6)).total.backward()
     # softmax does not see what is added to all its inputs alike
+    assert [n for n in unreached(model) if not n.endswith("attn.key.bias")] == []
+
+
+@pytest.mark.parametrize("kind", ["joint", "transformer"])
+def test_dreamt_rows_are_what_the_memory_expected(kind):
+    """With all rows of a window dreamt, the first ones are those of a dream from its first row on."""
+    torch.manual_seed(0)
+    settings = {"lidar": "1d", "z_size": 8, "residual": True, "action_alignment": "taken"}
+    settings |= {"h_size": 16} if kind == "joint" else {"n_blocks": 2, "n_heads": 2, "context": 8}
+    model = checkpoint.make(kind, settings).eval()
+    recipe = default_recipe(kind, "1d").replace(dream_share=1.0)
+    z, mask = torch.randn(16, 6, 8), torch.ones(16, 6, dtype=torch.bool)
+    mask[:, 5] = False
+    batch = {"mask": mask, "goal": torch.randn(16, 6, 2), "action": torch.randn(16, 6, 3)}
+    state = _zero_state(model, z)
+    fed, fed_goal = _partly_dreamt(model, z, batch, recipe, Noise.seeded(1), state)
+    dreaming = (fed[:, 1] != z[:, 1]).any(1)
+    assert 3 <= int(dreaming.sum()) <= 13  # every second window
+    torch.testing.assert_close(fed[~dreaming], z[~dreaming])
+    torch.testing.assert_close(fed_goal[~dreaming], batch["goal"][~dreaming])
+    torch.testing.assert_close(fed[:, [0, 5]], z[:, [0, 5]])  # first rows, and padding
+    dream, goal = z[dreaming][:, :1], batch["goal"][dreaming][:, :1]
+    for length in (1, 2, 3):
+        h, _ = model.hidden(dream, goal, batch["action"][dreaming][:, :length], None, _zero_state(model, dream))
+        ahead = model.heads(dream, goal, h)
+        dream, goal = torch.cat([dream, ahead[0][:, -1:]], 1), torch.cat([goal, ahead[1][:, -1:]], 1)
+    torch.testing.assert_close(fed[dreaming][:, :4], dream, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(fed_goal[dreaming][:, :4], goal, atol=1e-5, rtol=1e-4)
+
+
+def test_dreaming_costs_real_rows_nothing_and_teaches_all():
+    from navrep_data.train.data import part
+
+    torch.manual_seed(0)
+    model = TransformerWorldModel(TransformerConfig("1d", 16, 2, 2, 4, residual=True)).train()
+    batch = part(batch_of(2, 4, [4, 4]), 0, 2)
+    plain = default_recipe("transformer", "1d").replace(kl_weight=0.0)
+
+    def found(share):
+        return world_model_loss(
+            model, batch, plain.replace(dream_share=share), 0, Noise.seeded(2), Counts(8, 6, 8, 6)
+        )  # fmt: skip
+
+    without, half = found(0.0), found(0.5)
+    assert half.parts["rec"] == pytest.approx(without.parts["rec"], abs=1e-6)
+    assert half.parts["pred"] != without.parts["pred"]
+    half.total.backward()
     assert [n for n in unreached(model) if not n.endswith("attn.key.bias")] == []
 
 

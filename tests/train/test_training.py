@@ -216,6 +216,24 @@ def test_m_wants_codes_and_starts_only_from_its_own_kind(dataset, tmp_path, late
 
 
 @pytest.mark.parametrize("model", ["joint", "transformer"])
+def test_a_frozen_v_stays_and_the_memory_learns(model, dataset, tmp_path):
+    started = recipe(model, "1d", steps=1, z_size=8, h_size=16)
+    first = checkpoint.load(train(started, dataset, tmp_path / "first").out)
+    frozen = recipe(model, "1d", steps=2, z_size=8, h_size=16, seed=3, freeze_v=True)
+    train(frozen, dataset, tmp_path / "w", init=first, stop_after=1)
+    done = checkpoint.load(train(frozen, dataset, tmp_path / "w", resume=True).out)
+    before = first.state_dict()
+    moved = {name for name, value in done.state_dict().items() if not torch.equal(value, before[name])}
+    assert moved
+    assert not [name for name in moved if name.startswith("vae.")]
+    with pytest.raises(ConfigError, match="freeze_v keeps V as --init gives it, but there is none") as error:
+        train(frozen, dataset, tmp_path / "none")
+    one_line(error)
+    with pytest.raises(ConfigError, match="freeze_v is for joint and transformer"):
+        recipe("v", "1d", freeze_v=True)
+
+
+@pytest.mark.parametrize("model", ["joint", "transformer"])
 def test_world_models_start_from_a_v(model, dataset, tmp_path):
     v = train(recipe("v", "1d", steps=1, z_size=8), dataset, tmp_path / "v")
     start = checkpoint.load(v.out)
