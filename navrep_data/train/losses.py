@@ -155,7 +155,7 @@ def world_model_loss(
     memory_noise = None if noise is None else Noise(noise.generator, recipe.dropout)
     fed_z, fed_goal = z, batch["goal"]
     if noise is not None and recipe.dream_share > 0.0:
-        fed_z, fed_goal = _partly_dreamt(model, z, batch, recipe, noise, state)
+        fed_z, fed_goal = _partly_dreamt(model, z, batch, recipe, noise)
     h, _ = model.hidden(fed_z, fed_goal, batch["action"], memory_noise, state)
     next_z, next_goal = model.heads(fed_z, fed_goal, h)
     rec_at, pred_at = mask & batch["reconstruct"], next_mask & batch["predict"]
@@ -176,26 +176,29 @@ def world_model_loss(
 
 
 def _partly_dreamt(
-    model: WorldModel, z: Tensor, batch: dict[str, Tensor], recipe: Recipe, noise: Noise, state: LSTMState | None
+    model: WorldModel, z: Tensor, batch: dict[str, Tensor], recipe: Recipe, noise: Noise
 ) -> tuple[Tensor, Tensor]:
     """Return z and goals whose rows are partly what the model itself expected of them.
 
     A dream is fed its own predictions: a memory that has only seen real rows drifts away from them within a few steps.
     The other half of the windows stays real, so that what follows real rows is learned as before.
     """
-    mask = batch["mask"]
+    mask, real_goal = batch["mask"], batch["goal"]
     draw = torch.rand(mask.shape[0], mask.shape[1] + 1, generator=noise.generator, device=z.device)
-    chosen = mask & (draw[:, :1] < _DREAMING_WINDOWS) & (draw[:, 1:] < recipe.dream_share)
+    windows = torch.nonzero(draw[:, 0] < _DREAMING_WINDOWS).squeeze(1)
+    if len(windows) == 0:
+        return z, real_goal
+    chosen = (mask & (draw[:, 1:] < recipe.dream_share))[windows][..., None]
     chosen[:, 0] = False
-    fed_z, fed_goal = z, batch["goal"]
     with torch.no_grad():
+        awake, goal, action = z[windows], real_goal[windows], batch["action"][windows]
+        fed_z, fed_goal = awake, goal
         for _ in range(_DREAM_PASSES):
-            h, _ = model.hidden(fed_z, fed_goal, batch["action"], None, state)
-            ahead = model.heads(fed_z, fed_goal, h)
-            before = [torch.cat([x[:, :1], x[:, :-1]], 1) for x in ahead]
-            fed_z = torch.where(chosen[..., None], before[0], z.detach())
-            fed_goal = torch.where(chosen[..., None], before[1], batch["goal"])
-    return torch.where(chosen[..., None], fed_z, z), fed_goal
+            h, _ = model.hidden(fed_z, fed_goal, action, None, _zero_state(model, awake))
+            before = [torch.cat([x[:, :1], x[:, :-1]], 1) for x in model.heads(fed_z, fed_goal, h)]
+            fed_z, fed_goal = torch.where(chosen, before[0], awake), torch.where(chosen, before[1], goal)
+    dreamt = torch.where(chosen, fed_z, z[windows])
+    return z.index_copy(0, windows, dreamt), real_goal.index_copy(0, windows, fed_goal)
 
 
 def _zero_state(model: WorldModel, z: Tensor) -> LSTMState | None:

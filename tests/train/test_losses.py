@@ -158,8 +158,7 @@ def test_dreamt_rows_are_what_the_memory_expected(kind):
     z, mask = torch.randn(16, 6, 8), torch.ones(16, 6, dtype=torch.bool)
     mask[:, 5] = False
     batch = {"mask": mask, "goal": torch.randn(16, 6, 2), "action": torch.randn(16, 6, 3)}
-    state = _zero_state(model, z)
-    fed, fed_goal = _partly_dreamt(model, z, batch, recipe, Noise.seeded(1), state)
+    fed, fed_goal = _partly_dreamt(model, z, batch, recipe, Noise.seeded(1))
     dreaming = (fed[:, 1] != z[:, 1]).any(1)
     assert 3 <= int(dreaming.sum()) <= 13  # every second window
     torch.testing.assert_close(fed[~dreaming], z[~dreaming])
