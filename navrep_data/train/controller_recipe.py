@@ -80,7 +80,7 @@ class ControllerRecipe:
     worlds: int = 256
     rollout: int = 16
     batch: int = 512
-    epochs: int = 4
+    epochs: int = 3
     lr: float = 5e-4
     gamma: float = 0.99
     gae_lambda: float = 0.95
