@@ -57,7 +57,7 @@ def world_model_command(
             )
         )  # fmt: skip
         if out is not None:
-            say_err(f"wrote {files.save(results[-1], out, dataset_record(data), weights_of(name))}")
+            say_err(f"wrote {files.save(results[-1], out, dataset_record(data), weights_of(name), limit)}")
     if figure is not None:
         files.figure(results, figure)
     if as_json:

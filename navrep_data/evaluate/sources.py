@@ -155,13 +155,14 @@ def world_model_entries(folder: Path, record: Record) -> list[dict[str, Any]]:
         if result.name != record.name:
             continue
         _same_weights(about["files"], record, os.fspath(folder))
+        some = "" if about["limit"] is None else f" --limit {about['limit']}"
         keys = ("scan_mse", "goal_mse", "reconstruction_mse", "still_scan_mse", "still_goal_mse")
         entries.append(
             {
                 "suite": "world-model", "split": result.split, "rows": result.rows,
                 **{key: None if (v := getattr(result, key)) is None else float(f"{v:.6g}") for key in keys},
                 "data": {key: about["data"].get(key) for key in ("name", "content_hash", "rows")},
-                "command": f"navrep-data evaluate world-model {record.name} --data DIR --split {result.split}",
+                "command": f"navrep-data evaluate world-model {record.name} --data DIR --split {result.split}{some}",
             }
         )  # fmt: skip
     return entries

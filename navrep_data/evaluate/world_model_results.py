@@ -17,7 +17,9 @@ FOLDER = "world-model"
 _MAX_BYTES = 1 << 20
 
 
-def save(result: WorldModelError, out: Path | str, data: dict[str, Any], files: dict[str, str]) -> Path:
+def save(
+    result: WorldModelError, out: Path | str, data: dict[str, Any], files: dict[str, str], limit: int | None = None
+) -> Path:
     """Write one result as ``out/world-model/NAME.SPLIT.json``.
 
     Parameters
@@ -30,6 +32,8 @@ def save(result: WorldModelError, out: Path | str, data: dict[str, Any], files: 
         What identifies the dataset: its record, see :func:`navrep_data.shards.dataset_record`.
     files : dict of str to str
         Hashes of the weights, by file.
+    limit : int, optional
+        Windows looked at where not all were.
 
     Returns
     -------
@@ -47,7 +51,7 @@ def save(result: WorldModelError, out: Path | str, data: dict[str, Any], files: 
         path,
         {
             "format": FORMAT, "version": FORMAT_VERSION, "navrep_data": __version__, "data": data, "files": files,
-            "result": result.to_dict(),
+            "result": result.to_dict(), **({} if limit is None else {"limit": limit}),
         },
     )  # fmt: skip
     return path
@@ -60,7 +64,7 @@ def load(path: Path | str) -> tuple[WorldModelError, dict[str, Any]]:
     -------
     result : WorldModelError
     about : dict
-        ``data`` and ``files`` as given to :func:`save`, ``navrep_data`` the version.
+        ``data``, ``files`` and ``limit`` as given to :func:`save`, ``navrep_data`` the version.
 
     Raises
     ------
@@ -72,7 +76,9 @@ def load(path: Path | str) -> tuple[WorldModelError, dict[str, Any]]:
         if value["format"] != FORMAT or value["version"] != FORMAT_VERSION:
             raise ValueError(f"format {value['format']!r} version {value['version']!r}")
         result = WorldModelError(**value["result"])
-        about = {key: value[key] for key in ("data", "files", "navrep_data")}
+        about = {key: value[key] for key in ("data", "files", "navrep_data")} | {"limit": value.get("limit")}
+        if type(about["limit"]) not in (int, type(None)):
+            raise ValueError(f"limit {str(about['limit'])[:40]!r}")
     except (KeyError, TypeError, ValueError) as error:
         raise CorruptDataError(
             f"{os.fspath(path)} is no world-model result of this version ({error}). Expected one written by "

@@ -4,9 +4,9 @@ Notes
 -----
 Rings hold 0, 1/2 and 1, which 8 bits represent exactly, so only weights and the maps between layers are rounded: one
 scale per output channel for weights, one per map, from observations that it is calibrated on. Ranges would be cut to
-steps of 10 cm, so the first layer of the 1D encoder, a fiftieth of its work, stays in float32. Features move by a
+steps of 10 cm, so the first layer of the 1D encoder, a fortieth of its work, stays in float32. Features move by a
 hundredth of their spread; with bfloat16 by a few thousandths. benchmarks/training.py measures the speed, on an AMD
-EPYC without matrix units 1.8 (rings) and 1.5 (1D) times that of bfloat16.
+EPYC without matrix units 1.8 (rings) and 1.4 (1D) times that of bfloat16.
 """
 
 from __future__ import annotations

@@ -43,9 +43,7 @@ class GroupedPPO(PPO):
 
     policy: BoundedPolicy
 
-    def collect_rollouts(
-        self, env: Any, callback: Any, rollout_buffer: RolloutBuffer, n_rollout_steps: int
-    ) -> bool:  # fmt: skip
+    def collect_rollouts(self, env: Any, callback: Any, rollout_buffer: RolloutBuffer, n_rollout_steps: int) -> bool:
         """Fill the buffer, every group of worlds in its own thread."""
         assert isinstance(env, WorldGroups)
         self.policy.set_training_mode(False)

@@ -115,10 +115,13 @@ def test_results_are_files(dataset, tmp_path):
     found = world_model_error(make("joint"), dataset, split="val", steps=2, name="./models/joint 1")
     path = save(found, tmp_path, {"name": "d", "content_hash": "0"}, {"model": "1"})
     assert path == tmp_path / "world-model" / ".-models-joint-1.val.json"
-    assert load(path) == (
-        found,
-        {"data": {"name": "d", "content_hash": "0"}, "files": {"model": "1"}, "navrep_data": __version__},
-    )
+    about = {"data": {"name": "d", "content_hash": "0"}, "files": {"model": "1"}, "navrep_data": __version__}
+    assert load(path) == (found, {**about, "limit": None})
+    assert load(save(found, tmp_path, about["data"], about["files"], 40)) == (found, {**about, "limit": 40})
+    path.write_text(path.read_text().replace(": 40", ': "40 and more"'))
+    with pytest.raises(CorruptDataError, match="limit '40 and more'"):
+        load(path)
+    save(found, tmp_path, about["data"], about["files"])
     path.write_text(path.read_text().replace('"rows"', '"lines"'))
     with pytest.raises(CorruptDataError, match="no world-model result of this version"):
         load(path)

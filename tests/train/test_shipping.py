@@ -237,6 +237,9 @@ def test_measured_errors_reach_record_and_card(trained, package, dataset, tmp_pa
     assert len(record.results) == 1
     assert record.results[0]["scan_mse"] == pytest.approx(found.scan_mse, rel=1e-4)
     assert f"`navrep-data evaluate world-model {w.name} --data DIR --split val`" in own_cards.own_card(record)
+    save(found, tmp_path, dataset_record(dataset), weights_of(w.name), 9)
+    record = shipping.add_results(w.name, tmp_path, root=package)
+    assert f"{w.name} --data DIR --split val --limit 9`" in own_cards.own_card(record)
     assert "MSE, val split" in "\n".join(cards.describe(record))
     value = json.loads(path.read_text())
     value["files"] = dict.fromkeys(value["files"], "0" * 64)
