@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -155,7 +156,8 @@ def world_model_loss(
     memory_noise = None if noise is None else Noise(noise.generator, recipe.dropout)
     fed_z, fed_goal = z, batch["goal"]
     if noise is not None and recipe.dream_share > 0.0:
-        fed_z, fed_goal = _partly_dreamt(model, z, batch, recipe, noise)
+        expected = _expects(model, batch)
+        fed_z, fed_goal = partly_dreamt(z, batch["goal"], mask, expected, recipe.dream_share, noise)
     h, _ = model.hidden(fed_z, fed_goal, batch["action"], memory_noise, state)
     next_z, next_goal = model.heads(fed_z, fed_goal, h)
     rec_at, pred_at = mask & batch["reconstruct"], next_mask & batch["predict"]
@@ -175,30 +177,56 @@ def world_model_loss(
     return Terms(total, {**{name: float(value.detach()) for name, value in parts.items()}, **found})
 
 
-def _partly_dreamt(
-    model: WorldModel, z: Tensor, batch: dict[str, Tensor], recipe: Recipe, noise: Noise
+class Expects(Protocol):
+    """What a memory expects of the next rows of the chosen windows: z (W, T, Z) and goal (W, T, 2) [m]."""
+
+    def __call__(self, windows: Tensor, z: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Feed it z (W, T, Z) and goal (W, T, 2) [m] of the windows with these indices (W,)."""
+
+
+def partly_dreamt(
+    z: Tensor, real_goal: Tensor, may: Tensor, expects: Expects, share: float, noise: Noise
 ) -> tuple[Tensor, Tensor]:
-    """Return z and goals whose rows are partly what the model itself expected of them.
+    """Return z and goals whose rows are partly what the memory itself expected of them.
 
     A dream is fed its own predictions: a memory that has only seen real rows drifts away from them within a few steps.
     The other half of the windows stays real, so that what follows real rows is learned as before.
+
+    Parameters
+    ----------
+    z, real_goal : Tensor of shape (B, T, Z), (B, T, 2) [m]
+        Real rows.
+    may : Tensor of shape (B, T)
+        Rows that follow the row before them; the first of a window never does.
+    expects : callable
+        The memory.
+    share : float
+        Share of those rows that are dreamt, in windows that dream.
+    noise : Noise
+        Draws them.
     """
-    mask, real_goal = batch["mask"], batch["goal"]
-    draw = torch.rand(mask.shape[0], mask.shape[1] + 1, generator=noise.generator, device=z.device)
+    draw = torch.rand(may.shape[0], may.shape[1] + 1, generator=noise.generator, device=z.device)
     windows = torch.nonzero(draw[:, 0] < _DREAMING_WINDOWS).squeeze(1)
     if len(windows) == 0:
         return z, real_goal
-    chosen = (mask & (draw[:, 1:] < recipe.dream_share))[windows][..., None]
+    chosen = (may & (draw[:, 1:] < share))[windows][..., None]
     chosen[:, 0] = False
     with torch.no_grad():
-        awake, goal, action = z[windows], real_goal[windows], batch["action"][windows]
+        awake, goal = z[windows], real_goal[windows]
         fed_z, fed_goal = awake, goal
         for _ in range(_DREAM_PASSES):
-            h, _ = model.hidden(fed_z, fed_goal, action, None, _zero_state(model, awake))
-            before = [torch.cat([x[:, :1], x[:, :-1]], 1) for x in model.heads(fed_z, fed_goal, h)]
+            before = [torch.cat([x[:, :1], x[:, :-1]], 1) for x in expects(windows, fed_z, fed_goal)]
             fed_z, fed_goal = torch.where(chosen, before[0], awake), torch.where(chosen, before[1], goal)
     dreamt = torch.where(chosen, fed_z, z[windows])
     return z.index_copy(0, windows, dreamt), real_goal.index_copy(0, windows, fed_goal)
+
+
+def _expects(model: WorldModel, batch: dict[str, Tensor]) -> Expects:
+    def expects(windows: Tensor, z: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        h, _ = model.hidden(z, goal, batch["action"][windows], None, _zero_state(model, z))
+        return model.heads(z, goal, h)
+
+    return expects
 
 
 def _zero_state(model: WorldModel, z: Tensor) -> LSTMState | None:
@@ -227,7 +255,11 @@ def restart_loss(logit: Tensor, target: Tensor, factor: float) -> Tensor:
 
 
 def memory_loss(
-    memory: MDNRNN, batch: dict[str, Tensor], recipe: Recipe, state: LSTMState | None = None
+    memory: MDNRNN,
+    batch: dict[str, Tensor],
+    recipe: Recipe,
+    state: LSTMState | None = None,
+    noise: Noise | None = None,
 ) -> tuple[Terms, LSTMState]:
     """Return M's loss on a batch of code sequences, and the LSTM states at their ends.
 
@@ -242,12 +274,17 @@ def memory_loss(
         Settings.
     state : pair of Tensor, optional
         LSTM states (1, B, H) before the first rows, to which a restart brings them back; zero if left out.
+    noise : Noise, optional
+        Draws the rows that are dreamt; None = validation, or no dreams.
     """
-    inputs = memory.inputs(batch["z"], batch["goal"], batch["action"], batch["restart"])
+    z, goal, restarts = batch["z"], batch["goal"], batch["restart"]
+    if noise is not None and recipe.dream_share > 0.0:
+        may = batch["mask"] & ~restarts.bool()
+        z, goal = partly_dreamt(z, goal, may, _memory_expects(memory, batch), recipe.dream_share, noise)
+    inputs = memory.inputs(z, goal, batch["action"], restarts)
     h, after = run_with_restarts(memory, inputs, batch["restart"], batch["mask"], state)
     mixture = memory.mixture(h)
-    goal_change = (batch["next_goal"] - batch["goal"]) / RANGE_MAX
-    change = torch.cat([batch["next_z"] - batch["z"], goal_change], dim=-1)
+    change = torch.cat([batch["next_z"] - z, (batch["next_goal"] - goal) / RANGE_MAX], dim=-1)
     where = batch["next_mask"].to(h.dtype)
     n = where.sum().clamp_min(1.0)
     each = mixture_nll(mixture, change)
@@ -262,6 +299,17 @@ def memory_loss(
         "goal_error_m2": (error[..., -GOAL_SIZE:].square().mean(-1) * where).sum() / n * RANGE_MAX**2,
     }
     return Terms(nll + restart, {name: float(value.detach()) for name, value in parts.items()}), after
+
+
+def _memory_expects(memory: MDNRNN, batch: dict[str, Tensor]) -> Expects:
+    def expects(windows: Tensor, z: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        restart = batch["restart"][windows]
+        inputs = memory.inputs(z, goal, batch["action"][windows], restart)
+        h, _ = run_with_restarts(memory, inputs, restart, batch["mask"][windows], None)
+        change = memory.mixture(h).likeliest()
+        return z + change[..., :-GOAL_SIZE], goal + change[..., -GOAL_SIZE:] * RANGE_MAX
+
+    return expects
 
 
 def run_with_restarts(

@@ -112,7 +112,7 @@ class Recipe:
     reconstruct_share, predict_share : float
         Share of the rows, drawn anew every step, whose reconstruction and prediction are decoded and compared.
     dream_share : float
-        Joint and transformer: share of the rows of every second window, drawn anew every step, that the memory is fed
+        All but v: share of the rows of every second window, drawn anew every step, that the memory is fed
         as it expected them itself instead of as they were, so that dreams stay with what it knows. 0 = none.
     freeze_v : bool
         Joint and transformer: V stays as ``--init`` gives it, so that controllers that see through it stay valid; only
@@ -241,7 +241,7 @@ def default_recipe(model: str, lidar: str) -> Recipe:
     if model == "m":
         return Recipe(
             model, lidar, h_size=512, batch=64, micro_batch=64, window=64, stride=64, kl_weight=0.0, goal_scale=25.0,
-            ranges_weight=0.0, people_weight=0.0,
+            dream_share=0.5, ranges_weight=0.0, people_weight=0.0,
         )  # fmt: skip
     recipe = Recipe(model, lidar, dream_share=0.0 if model == "v" else 0.5)
     if lidar == "1d":  # squared errors of ranges are a hundredth of the cross entropy of cells

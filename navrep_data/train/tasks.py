@@ -189,7 +189,7 @@ class MemoryTask:
         noise = Noise(generator(self.recipe, step, _NOISE, self.device), 0.0)
         codes = self._codes(_to(batch, self.device), noise)
         state = (self.extra["h"], self.extra["c"]) if self.recipe.original and "h" in self.extra else None
-        terms, after = memory_loss(self.model, codes, self.recipe, state)
+        terms, after = memory_loss(self.model, codes, self.recipe, state, noise)
         if self.recipe.original:
             self.extra = {"h": after[0], "c": after[1]}
         yield terms

@@ -17,12 +17,14 @@ from navrep_data.models import (
 from navrep_data.train import default_recipe, original_recipe
 from navrep_data.train.losses import (
     Counts,
-    _partly_dreamt,
+    _expects,
+    _memory_expects,
     _zero_state,
     divergence,
     memory_loss,
     mixture_nll,
     observation_loss,
+    partly_dreamt,
     restart_loss,
     run_with_restarts,
     vae_loss,
@@ -158,7 +160,9 @@ def test_dreamt_rows_are_what_the_memory_expected(kind):
     z, mask = torch.randn(16, 6, 8), torch.ones(16, 6, dtype=torch.bool)
     mask[:, 5] = False
     batch = {"mask": mask, "goal": torch.randn(16, 6, 2), "action": torch.randn(16, 6, 3)}
-    fed, fed_goal = _partly_dreamt(model, z, batch, recipe, Noise.seeded(1))
+    fed, fed_goal = partly_dreamt(
+        z, batch["goal"], batch["mask"], _expects(model, batch), recipe.dream_share, Noise.seeded(1)
+    )
     dreaming = (fed[:, 1] != z[:, 1]).any(1)
     assert 3 <= int(dreaming.sum()) <= 13  # every second window
     torch.testing.assert_close(fed[~dreaming], z[~dreaming])
@@ -171,6 +175,53 @@ def test_dreamt_rows_are_what_the_memory_expected(kind):
         dream, goal = torch.cat([dream, ahead[0][:, -1:]], 1), torch.cat([goal, ahead[1][:, -1:]], 1)
     torch.testing.assert_close(fed[dreaming][:, :4], dream, atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(fed_goal[dreaming][:, :4], goal, atol=1e-5, rtol=1e-4)
+
+
+def test_m_dreams_until_an_episode_ends():
+    torch.manual_seed(0)
+    memory = MDNRNN(MemoryConfig(8, 16, 3, "taken")).eval()
+    z, goal, action = torch.randn(16, 6, 8), torch.randn(16, 6, 2), torch.randn(16, 6, 3)
+    restart, mask = torch.zeros(16, 6), torch.ones(16, 6, dtype=torch.bool)
+    restart[:, 3], mask[:, 5] = 1.0, False
+    batch = {"mask": mask, "action": action, "restart": restart}
+    may = mask & ~restart.bool()
+    fed, fed_goal = partly_dreamt(z, goal, may, _memory_expects(memory, batch), 1.0, Noise.seeded(1))
+    dreaming = (fed[:, 1] != z[:, 1]).any(1)
+    assert 3 <= int(dreaming.sum()) <= 13
+    torch.testing.assert_close(fed[:, [0, 3, 5]], z[:, [0, 3, 5]])  # first rows of windows and episodes, and padding
+    for first, last in ((0, 3), (3, 5)):
+        flags = restart[dreaming][:, first:last]
+        dream, ahead_goal = z[dreaming][:, first : first + 1], goal[dreaming][:, first : first + 1]
+        for length in range(1, last - first):
+            actions = action[dreaming][:, first : first + length]
+            h, _ = memory.hidden(memory.inputs(dream, ahead_goal, actions, flags[:, :length]))
+            change = memory.mixture(h[:, -1:]).likeliest()
+            dream = torch.cat([dream, dream[:, -1:] + change[..., :8]], 1)
+            ahead_goal = torch.cat([ahead_goal, ahead_goal[:, -1:] + change[..., 8:] * 25.0], 1)
+        torch.testing.assert_close(fed[dreaming][:, first:last], dream, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(fed_goal[dreaming][:, first:last], ahead_goal, atol=1e-5, rtol=1e-4)
+
+
+def test_m_learns_the_way_back_from_its_dreams():
+    torch.manual_seed(0)
+    memory = MDNRNN(MemoryConfig(8, 16, 3, "taken"))
+    with torch.no_grad():  # a memory that always expects a step of 1 in z[0]
+        memory.output.weight.zero_()
+        memory.output.bias.zero_()
+        memory.output.bias[1:].reshape(10, 3, 3)[0, 1] = 1.0
+    z, goal = torch.zeros(64, 5, 8), torch.zeros(64, 5, 2)
+    batch = {
+        "z": z[:, :-1], "next_z": z[:, 1:], "goal": goal[:, :-1], "next_goal": goal[:, 1:],
+        "action": torch.zeros(64, 4, 3), "restart": torch.zeros(64, 4), "next_last": torch.zeros(64, 4),
+        "mask": torch.ones(64, 4, dtype=torch.bool), "next_mask": torch.ones(64, 4, dtype=torch.bool),
+    }  # fmt: skip
+    recipe = default_recipe("m", "1d").replace(dream_share=1.0)
+    real = memory_loss(memory, batch, recipe, noise=None)[0].parts
+    dreamt = memory_loss(memory, batch, recipe, noise=Noise.seeded(1))[0].parts
+    # rows 0..3 have drifted by 0, 1, 2 and 3 and expect one more: half the windows are off by 1, 2, 3, 4 in z[0]
+    assert real["z_error"] == pytest.approx(1 / 8)
+    assert 0.3 < (dreamt["z_error"] - 1 / 8) / ((30 / 4 - 1) / 8) < 0.7
+    assert real == memory_loss(memory, batch, recipe.replace(dream_share=0.0), noise=Noise.seeded(1))[0].parts
 
 
 def test_dreaming_costs_real_rows_nothing_and_teaches_all():
