@@ -4,7 +4,8 @@
 
 World models: one training step on frames in memory (forward, backward, AdamW), ours against the layers as they are
 written (float32, torch's transposed convolutions, everything decoded), in turns (A B A B ...). Encoders in 8 bits, as
-controllers are trained through them, likewise against themselves in bfloat16. Controllers: whole PPO iterations
+controllers are trained through them, likewise against themselves in bfloat16; convolutions of end-to-end networks
+there and back. Controllers: whole PPO iterations
 (rollout in 256 worlds, encoding, update), as the default recipe has them. Wall time, with as many threads as torch
 takes.
 """
@@ -24,6 +25,7 @@ from report import describe, number, table, write_section
 WORLD_MODELS = ("transformer_rings", "joint_rings", "transformer_1d", "joint_1d")
 CONTROLLERS = ("rings_z", "1d_z")
 ENCODERS = ("encoder_rings", "encoder_1d")
+END_TO_END = ("e2e_rings", "e2e_1d")
 MUST = {"transformer_rings": 900, "rings_z": 10_000, "1d_z": 18_000}
 AIMS = {"transformer_rings": 1_300, "rings_z": 14_000, "1d_z": 25_000}
 WINDOWS = 32
@@ -112,6 +114,30 @@ def encoders(lidar: str) -> list[Callable[[], float]]:
     return [work(QuantizedEncoder(vae, obs)), work(FrozenEncoder.of(vae, "bfloat16"))]
 
 
+def extractors(lidar: str) -> list[Callable[[], float]]:
+    """Return work that passes 1,024 rows through an end-to-end network's convolutions and back, ours and as written."""
+    import gymnasium
+    import numpy as np
+    import torch
+
+    from navrep_data.train.ppo_policy import FastExtractor
+    from navrep_data.zoo.sb3 import EndToEndExtractor
+
+    torch.manual_seed(0)
+    space = gymnasium.spaces.Box(-np.inf, np.inf, ({"rings": 4101, "1d": 1085}[lidar],), np.float32)
+    rows = torch.rand(1024, *space.shape)
+
+    def work(extractor: torch.nn.Module) -> Callable[[], float]:
+        def once() -> float:
+            extractor.zero_grad()
+            extractor(rows).square().sum().backward()
+            return float(len(rows))
+
+        return once
+
+    return [work(FastExtractor(space, lidar, "bfloat16")), work(EndToEndExtractor(space, lidar))]
+
+
 def controller(name: str, seconds: float) -> dict[str, Any]:
     """Return steps per second of PPO iterations, and where they go."""
     import torch
@@ -148,11 +174,12 @@ def measure(name: str, repeats: int, seconds: float) -> dict[str, Any]:
     if name in CONTROLLERS:
         row = controller(name, repeats * seconds)
     else:
-        both = (
-            encoders(name.split("_")[1])
-            if name in ENCODERS
-            else [training_step(name, False), training_step(name, True)]
-        )
+        if name in ENCODERS:
+            both = encoders(name.split("_")[1])
+        elif name in END_TO_END:
+            both = extractors(name.split("_")[1])
+        else:
+            both = [training_step(name, False), training_step(name, True)]
         ours, other = in_turns(both, repeats, seconds)
         mine = spread(ours.wall)
         row = {
@@ -168,7 +195,8 @@ INTRODUCTION = """## Training
 {machine}
 
 World models: frames per second of a training step of 32 windows, against the layers as they are written. Encoders in
-8 bits: frames per second, against bfloat16. Controllers: steps per second of whole PPO iterations in 256 worlds
+8 bits: frames per second, against bfloat16. e2e: rows per second through an end-to-end network's convolutions and back,
+against the layers as they are written. Controllers: steps per second of whole PPO iterations in 256 worlds
 (rollout, encoding, update). {threads} threads, wall time, medians over turns.
 """
 
@@ -192,7 +220,9 @@ def show(row: dict[str, Any]) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", default=[*WORLD_MODELS, *ENCODERS, *CONTROLLERS], metavar="NAME")
+    parser.add_argument(
+        "--only", nargs="+", default=[*WORLD_MODELS, *ENCODERS, *END_TO_END, *CONTROLLERS], metavar="NAME"
+    )
     parser.add_argument("--repeats", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--threads", type=int)

@@ -114,8 +114,14 @@ class EndToEnd(ActorCritic):
         self.encoder = convolutions(config.lidar)
         self.fc = nn.Linear(FLAT_SIZE, config.n_features)
 
-    def features(self, inputs: Tensor) -> Tensor:
-        """Return the numbers of the convolutions and the robot state, shape (B, n_features + 5)."""
+    def split(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return observations (B, ...) and robot states (B, 5) of inputs (B, 1085) or (B, 4101).
+
+        Raises
+        ------
+        ArrayError
+            If `inputs` have another size.
+        """
         shape = OBSERVATION_SHAPES[self.config.lidar]
         n_obs = math.prod(shape)
         if inputs.shape[-1] != n_obs + ROBOT_STATE_SIZE:
@@ -123,6 +129,10 @@ class EndToEnd(ActorCritic):
                 f"inputs have shape {tuple(inputs.shape)}, expected (B, {n_obs + ROBOT_STATE_SIZE}): observation and "
                 "robot state in one row."
             )
-        obs, robot_state = inputs[..., :n_obs].reshape(-1, *shape), inputs[..., n_obs:]
+        return inputs[..., :n_obs].reshape(-1, *shape), inputs[..., n_obs:]
+
+    def features(self, inputs: Tensor) -> Tensor:
+        """Return the numbers of the convolutions and the robot state, shape (B, n_features + 5)."""
+        obs, robot_state = self.split(inputs)
         x = self.encoder(as_images(obs, self.config.lidar)).flatten(1)
         return torch.cat([self.fc(x), robot_state], dim=-1)

@@ -64,7 +64,7 @@ class ControllerRecipe:
         Whether worlds start without humans and obstacles, for the curriculum to add; the authors' start with most.
     precision : str
         Of the frozen encoder during training: ``"int8"`` (where the processor cannot: as ``"bfloat16"``),
-        ``"bfloat16"`` or ``"float32"``. Validation is in float32.
+        ``"bfloat16"`` or ``"float32"``. Of the convolutions in ``"e2e"``, which learn. Validation is in float32.
     context : str
         What a joint or transformer memory keeps.
     validate_every : int

@@ -21,10 +21,9 @@ from navrep_data.sim import Simulator
 from navrep_data.train.controller_recipe import ControllerRecipe, environment
 from navrep_data.train.encode import vae_of
 from navrep_data.train.ppo import GroupedPPO
-from navrep_data.train.ppo_policy import BoundedPolicy
+from navrep_data.train.ppo_policy import BoundedPolicy, FastExtractor
 from navrep_data.train.worlds import TrainingWorlds, WorldGroups
 from navrep_data.zoo.policy import Policy
-from navrep_data.zoo.sb3 import EndToEndExtractor
 
 _CODES = 0.2
 _WORTH_A_GROUP = 64
@@ -90,6 +89,11 @@ def make_encoder(recipe: ControllerRecipe, model: Any) -> QuantizedEncoder | Non
     )
 
 
+def _floats(recipe: ControllerRecipe) -> str:
+    """Return what is computed with where 8 bits cannot be."""
+    return "bfloat16" if recipe.precision == "int8" else recipe.precision
+
+
 def make_policy(
     recipe: ControllerRecipe, network: Controller | EndToEnd, model: Any, name: str = "",
     encoder: QuantizedEncoder | None = None,
@@ -101,7 +105,7 @@ def make_policy(
     CheckpointError, ConfigError
         If they do not fit.
     """
-    dtype = "bfloat16" if recipe.precision == "int8" else recipe.precision
+    dtype = _floats(recipe)
     if recipe.features == "e2e":
         return Policy(network, None, recipe.lidar, name=name, dtype=dtype)
     world_model = model if isinstance(model, WorldModel) and "h" in recipe.features else None
@@ -141,8 +145,8 @@ def make_ppo(recipe: ControllerRecipe, worlds: WorldGroups, network: Controller 
     if isinstance(network, EndToEnd):
         kwargs |= {
             "activation_fn": nn.ReLU,
-            "features_extractor_class": EndToEndExtractor,
-            "features_extractor_kwargs": {"lidar": recipe.lidar},
+            "features_extractor_class": FastExtractor,
+            "features_extractor_kwargs": {"lidar": recipe.lidar, "precision": _floats(recipe)},
         }
     kind: type[ActorCriticPolicy] = ActorCriticPolicy
     algorithm = PPO

@@ -25,14 +25,19 @@ PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 def distribution(vae: VAE, obs: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Return mean and log-variance, float32, of observations (N, 64, 64) or (N, 1080); see :meth:`VAE.distribution`."""
-    x = as_images(obs, vae.config.lidar).to(dtype, memory_format=torch.channels_last)
-    for layer in vae.encoder:
+    x = maps(vae.encoder, obs, vae.config.lidar, dtype)
+    mu, logvar = (functional.linear(x, head.weight.to(dtype)).float() + head.bias for head in (vae.fc1, vae.fc2))
+    return mu, logvar
+
+
+def maps(encoder: nn.Sequential, obs: Tensor, lidar: str, dtype: torch.dtype) -> Tensor:
+    """Return the flattened maps, in `dtype`, that convolutions of V or end to end make of observations."""
+    x = as_images(obs, lidar).to(dtype, memory_format=torch.channels_last)
+    for layer in encoder:
         if isinstance(layer, nn.Conv2d):
             x = functional.conv2d(x, layer.weight.to(dtype), None, layer.stride)
             x = torch.relu_(_add_bias(x, layer.bias, dtype))
-    x = x.flatten(1)
-    mu, logvar = (functional.linear(x, head.weight.to(dtype)).float() + head.bias for head in (vae.fc1, vae.fc2))
-    return mu, logvar
+    return x.flatten(1)
 
 
 def decode_logits(vae: VAE, z: Tensor, dtype: torch.dtype) -> Tensor:

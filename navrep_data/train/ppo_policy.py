@@ -10,8 +10,14 @@ from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor
+from torch.nn import functional
 
+from navrep_data.train import passes
 from navrep_data.train.controller_recipe import MOST_STD
+from navrep_data.zoo.sb3 import EndToEndExtractor
+
+# Rows whose maps stay in the cache until the backward pass, in training as in rollouts.
+_CHUNK = 256
 
 
 class BoundedPolicy(ActorCriticPolicy):
@@ -47,3 +53,32 @@ class BoundedPolicy(ActorCriticPolicy):
     def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Distribution:
         assert isinstance(self.action_dist, DiagGaussianDistribution)
         return self.action_dist.proba_distribution(*self._distribution(latent_pi))
+
+
+class FastExtractor(EndToEndExtractor):
+    """The convolutions of an end-to-end network as training runs them: channels last, and in bfloat16 on request.
+
+    Parameters
+    ----------
+    observation_space : gymnasium.spaces.Box
+        Of shape (1085,) or (4101,).
+    lidar : str
+        ``"rings"`` or ``"1d"``.
+    precision : str
+        ``"float32"`` or ``"bfloat16"``.
+    """
+
+    def __init__(self, observation_space: spaces.Box, lidar: str, precision: str) -> None:
+        super().__init__(observation_space, lidar)
+        self.dtype = passes.PRECISIONS[precision]
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Return features of shape (B, 37)."""
+        return torch.cat([self._features(part) for part in torch.split(observations, _CHUNK)])
+
+    def _features(self, observations: Tensor) -> Tensor:
+        network = self.network
+        obs, robot_state = network.split(observations)
+        x = passes.maps(network.encoder, obs, network.config.lidar, self.dtype)
+        x = functional.linear(x, network.fc.weight.to(self.dtype)).float() + network.fc.bias
+        return torch.cat([x, robot_state], dim=-1)

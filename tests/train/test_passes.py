@@ -1,10 +1,14 @@
-"""V's fast passes against the plain modules: values and gradients."""
+"""Fast passes of V and of end-to-end networks against the plain modules: values and gradients."""
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 
 from navrep_data.models import VAE, VAEConfig
 from navrep_data.train import passes
+from navrep_data.train.ppo_policy import FastExtractor
+from navrep_data.zoo.sb3 import EndToEndExtractor
 
 
 def gradients(vae, loss):
@@ -39,3 +43,23 @@ def test_bfloat16_is_near(lidar, shape):
     assert fast.dtype == torch.float32
     assert float((fast - mu).abs().max()) < 0.05 * float(mu.abs().max())
     assert not torch.equal(fast, mu)
+
+
+@pytest.mark.parametrize(("lidar", "size"), [("rings", 4101), ("1d", 1085)])
+def test_end_to_end_values_and_gradients_are_those_of_the_plain_network(lidar, size):
+    torch.manual_seed(0)
+    space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+    plain = EndToEndExtractor(space, lidar)
+    inputs = torch.rand(300, size)  # more than one part
+    expected = plain(inputs)
+    slopes = gradients(plain, expected.square().sum())
+    for precision, tolerance in (("float32", 1e-4), ("bfloat16", 0.05)):
+        fast = FastExtractor(space, lidar, precision)
+        fast.load_state_dict(plain.state_dict())
+        features = fast(inputs)
+        assert features.dtype == torch.float32
+        away = (features - expected).detach().abs().max()
+        assert 0 < float(away) < tolerance * float(expected[:, :-5].detach().abs().max())
+        torch.testing.assert_close(features[:, -5:], inputs[:, -5:])
+        for name, value in gradients(fast, features.square().sum()).items():
+            assert float((value - slopes[name]).norm()) < tolerance * float(slopes[name].norm()), name
