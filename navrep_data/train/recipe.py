@@ -47,6 +47,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**31 - 1),
     "z_size": (1, 512),
     "h_size": (1, 4096),
+    "n_blocks": (1, 32),
     "validate_every": (1, 10**9),
     "validate_batches": (1, 10**6),
     "save_every": (1, 10**9),
@@ -67,8 +68,8 @@ class Recipe:
     original : bool
         Whether these are the authors' settings; then what cannot be a number follows them too: windows across
         episodes with frames blanked where an episode ends, random LSTM states, no choice of the best weights.
-    z_size, h_size : int
-        Numbers of z, and cells of the LSTM (not used by v and transformer).
+    z_size, h_size, n_blocks : int
+        Numbers of z, cells of the LSTM (m and joint), blocks of the transformer.
     action_alignment : str
         Which action a row is fed: ``"taken"`` (chosen at it, so that the next frame's cause is known) or
         ``"leading"`` (led to it, as the authors').
@@ -136,6 +137,7 @@ class Recipe:
     original: bool = False
     z_size: int = 64
     h_size: int = 64
+    n_blocks: int = 8
     action_alignment: str = "taken"
     residual: bool = True
     steps: int = 20_000

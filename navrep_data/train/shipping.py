@@ -212,6 +212,8 @@ def _parts(variant: str, training: _Training, world_model: str | None) -> dict[s
         raise CheckpointError(f"{variant} sees through {name}, which is not shipped: ship that first.")
     path = registry.FOLDER / shipped.files[0].path
     theirs, mine = checkpoint.load(path).state_dict(), training.model.state_dict()
+    if training.policy.features == "z":  # whose memory plays no part
+        theirs, mine = ({k: v for k, v in all_.items() if k.startswith("vae.")} for all_ in (theirs, mine))
     if theirs.keys() != mine.keys() or any(not torch.equal(t, mine[k].half().float()) for k, t in theirs.items()):
         raise CheckpointError(
             f"{training.folder} was trained through another world model than {name}: name the right one with "

@@ -88,8 +88,8 @@ def make_model(recipe: Recipe) -> nn.Module:
                 )  # fmt: skip
         return TransformerWorldModel(
             TransformerConfig(
-                recipe.lidar, recipe.z_size, context=recipe.window, action_alignment=recipe.action_alignment,
-                residual=recipe.residual,
+                recipe.lidar, recipe.z_size, recipe.n_blocks, context=recipe.window,
+                action_alignment=recipe.action_alignment, residual=recipe.residual,
             )
         )  # fmt: skip
 
@@ -406,15 +406,20 @@ def machine(device: torch.device) -> dict[str, Any]:
     }
 
 
+def _memory(model: WorldModel) -> tuple[object, ...]:
+    """Return what must agree for one memory's weights to fit another's."""
+    return (type(model), *(getattr(model.config, name, None) for name in ("h_size", "n_layers", "n_blocks")))
+
+
 def _start_from(model: nn.Module, init: nn.Module) -> None:
-    """Copy weights of a network of the same kind; of a V alone, or a world model of another kind, its V.
+    """Copy weights of a network of the same kind and size; of a V alone, or a world model with another memory, its V.
 
     Raises
     ------
     CheckpointError, ConfigError
         If it is of another kind, or fed other actions.
     """
-    if isinstance(init, WorldModel) and isinstance(model, WorldModel) and type(init) is not type(model):
+    if isinstance(init, WorldModel) and isinstance(model, WorldModel) and _memory(init) != _memory(model):
         init = init.vae
     if isinstance(init, VAE) and isinstance(model, WorldModel):
         if model.vae.config != init.config:

@@ -287,6 +287,14 @@ def test_what_does_not_belong_together_is_not_shipped(trained, package, dataset,
     checkpoint.save(other, package / "weights" / w.name, storage="float16")
     with pytest.raises(CheckpointError, match="another world model than"):
         shipping.ship(trained / "c", f"{VARIANT}_z", dataset, commands=["c"], **options)
+    # a controller on z alone goes with any memory behind the same V
+    other = checkpoint.load(trained / "w")
+    with torch.no_grad():
+        other.z_head.weight += 1.0
+    checkpoint.save(other, package / "weights" / w.name, storage="float16")
+    assert shipping.ship(trained / "c", f"{VARIANT}_z", dataset, commands=["c"], **options).parts == {
+        "world_model": w.name
+    }
 
 
 def test_rounding_sees_what_changed(trained, dataset):
