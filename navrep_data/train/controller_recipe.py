@@ -67,6 +67,9 @@ class ControllerRecipe:
         ``"bfloat16"`` or ``"float32"``. Of the convolutions in ``"e2e"``, which learn. Validation is in float32.
     context : str
         What a joint or transformer memory keeps.
+    refit : bool
+        ``--init`` names a controller that sees through another V: fit its first layers to the codes of this one first,
+        by least squares; see ``navrep_data.train.refit``. For ``"z"``.
     validate_every : int
         Steps between validations, each with a checkpoint.
     seed : int
@@ -99,6 +102,7 @@ class ControllerRecipe:
     easy_start: bool = True
     precision: str = "bfloat16"
     context: str = "newest-32"
+    refit: bool = False
     validate_every: int = 100_000
     seed: int = 0
 
@@ -118,6 +122,8 @@ class ControllerRecipe:
                 raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected true or false.")
             if field.type == "float" and (type(value) not in (int, float) or not 0 <= value <= 1e6):
                 raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected a number of at least 0.")
+        if self.refit and self.features != "z":
+            raise ConfigError(f"refit is for controllers on z, this is a recipe for {self.features}: leave it out.")
         if not 0.0 < self.least_std <= MOST_STD:
             raise ConfigError(f"least_std is {self.least_std}, expected more than 0, and {MOST_STD} at most.")
         if self.worlds * self.rollout % self.batch:

@@ -13,7 +13,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from navrep_data._version import __version__
-from navrep_data.errors import TrainingError
+from navrep_data.errors import ConfigError, TrainingError
 from navrep_data.io import atomic_write_json
 from navrep_data.models import Controller, EndToEnd, checkpoint
 from navrep_data.schema import Event, SensorContract
@@ -27,7 +27,7 @@ from navrep_data.train.controller_recipe import (
     environment,
     validation_environment,
 )
-from navrep_data.train.encode import weights_hash
+from navrep_data.train.encode import vae_of, weights_hash
 from navrep_data.train.learner import (
     make_encoder,
     make_network,
@@ -38,6 +38,7 @@ from navrep_data.train.learner import (
     scale_inputs,
 )
 from navrep_data.train.logs import Logger, curve
+from navrep_data.train.refit import refit
 from navrep_data.train.world_models import claim, machine
 from navrep_data.train.worlds import play
 from navrep_data.zoo.local import PARTS, POLICY_FILE
@@ -124,7 +125,7 @@ def train_controller(
     """
     out = Path(out)
     torch.manual_seed(recipe.seed)
-    network = make_network(recipe, model) if init is None else network_of(init, recipe, model)
+    network = _first_network(recipe, model, init, resume, report)
     used = None if recipe.features == "e2e" else weights_hash(model)
     claim(
         out, recipe.to_dict(), {"world_model": model_name, "world_model_sha256": used}, resume, free=("validate_every",)
@@ -132,6 +133,25 @@ def train_controller(
     with writer_lock(out):
         run = _Run(recipe, out, network, model, model_name, init is not None, resume, device)
         return run.train(recipe.steps if stop_after is None else min(stop_after, recipe.steps), progress, report)
+
+
+def _first_network(
+    recipe: ControllerRecipe, model: Any, init: Policy | None, resume: bool, report: Callable[[str], None] | None
+) -> Controller | EndToEnd:
+    """Return the network to start from; a resume overwrites its weights."""
+    if recipe.refit and init is None and not resume:
+        raise ConfigError(
+            "refit brings the controller of --init to this V, but there is none: name one, or leave it out."
+        )
+    if init is None:
+        return make_network(recipe, model)
+    if not recipe.refit:
+        return network_of(init, recipe, model)
+    make_network(recipe, model)  # whose checks hold here too
+    network, explained = refit(init, vae_of(model, "The world model"), environment(recipe))
+    if report is not None:
+        report(f"{init.name}: {100 * explained:.0f} % of its codes' variance is a linear function of the new codes")
+    return network
 
 
 def _stream(recipe: ControllerRecipe, step: int) -> int:

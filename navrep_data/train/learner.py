@@ -182,6 +182,6 @@ def network_of(init: Policy, recipe: ControllerRecipe, model: Any) -> Controller
     if init.lidar != recipe.lidar or first.in_features != other.in_features:
         raise CheckpointError(
             f"--init {init.name} has {first.in_features} inputs for {init.lidar}, expected {other.in_features} for "
-            f"{recipe.lidar}: name the world model that it was trained with."
+            f"{recipe.lidar}: name the world model that it was trained with, or --set refit=true."
         )
     return network
