@@ -180,8 +180,9 @@ def _recipe(
     earlier = [t.metadata["recipe"] for t in before]
     modular = training.policy is None and training.model is not None and training.model.config.kind == "modular"
     settings = used
-    if modular and earlier:  # V, the last one before, and M are two trainings of one recipe
-        settings = {"v": earlier.pop(), "m": used}
+    if modular:  # V, the last one before, and M are two trainings of one recipe
+        last = max((i for i, recipe in enumerate(earlier) if recipe.get("model") == "v"), default=None)
+        settings = used if last is None else {"v": earlier.pop(last), "m": used}
     if not commands and found.get("settings") != settings:
         old = found.get("settings") or {}
         other = sorted(k for k in {*old, *settings} if old.get(k) != settings.get(k))

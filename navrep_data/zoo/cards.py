@@ -9,6 +9,7 @@ The cards in the repository are committed; a test checks that they are what this
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,9 +23,10 @@ from navrep_data.zoo.registry import Record, dependants, records, variants
 _ARCHITECTURES = {
     "modular": "V and M trained one after the other: a variational autoencoder, then an LSTM with mixture outputs",
     "joint": "V and M trained as one: a variational autoencoder with an LSTM of two layers",
-    "transformer": "V and M trained as one: a variational autoencoder with a causal transformer of 8 blocks",
+    "transformer": "V and M trained as one: a variational autoencoder with a causal transformer of {blocks} blocks",
     "e2e": "one network from observation to action, no world model",
 }
+_INIT = re.compile(r"--init (\S+)")
 _FEATURES = {
     "z": "the code z of the current scan",
     "h": "the memory h of the world model",
@@ -44,7 +46,7 @@ _FORMATS = {
 
 def summary(r: Record) -> str:
     """Return in a sentence what a checkpoint is."""
-    architecture = _ARCHITECTURES[r.architecture]
+    architecture = _ARCHITECTURES[r.architecture].format(blocks=_blocks(r))
     if r.kind in ("policy", "controller"):
         reads = f"Controller on {_FEATURES[r.features]}, and the robot state. " if r.features else ""
         kind = "World model" if r.features else "Network"
@@ -94,6 +96,13 @@ def _feature_order(r: Record) -> str:
     return "[" + ", ".join(f"{name} ({sizes[name]})" for name in order) + "]"
 
 
+def _blocks(r: Record) -> int:
+    """Return the blocks of a record's transformer; the authors' all have 8."""
+    name = r.parts.get("world_model", r.name)
+    settings = (records()[name].training or {}).get("settings", {}) if name in records() else {}
+    return int(settings.get("n_blocks", 8))
+
+
 def quirks(r: Record) -> list[str]:
     """Return what a user of this checkpoint should know beforehand."""
     found = []
@@ -136,6 +145,12 @@ def _own_quirks(r: Record) -> list[str]:
     if r.kind == "policy":
         settings = (r.training or {})["settings"]
         found.append(f"Trained to drive at {settings['max_speed']:g} m/s at most; omega is always 0.")
+        before = _INIT.search(r.training["commands"][0]) if r.training else None
+        if before is not None and before[1] in records():
+            found.append(
+                f"Its controller went on from that of `{before[1]}`: their scores do not say what each representation "
+                "brings by itself."
+            )
     if r.action_alignment == "taken":
         found.append(
             "Action alignment `taken`: a row goes with the action chosen at it"

@@ -12,7 +12,12 @@ from __future__ import annotations
 RELEASED = "released"
 OWN = "v1"
 
-UNTAGGED_ARE_OURS = frozenset({"transformer_rings", "transformer_rings_z", "modular_1d", "modular_1d_z"})
+UNTAGGED_ARE_OURS = frozenset(
+    f"{kind}_{lidar}{features}"
+    for kind in ("modular", "joint", "transformer")
+    for lidar in ("rings", "1d")
+    for features in ("", "_z")
+)
 """Variants whose untagged name is ``.v1``, shipped or about to be; that of all others is ``.released``."""
 
 RELEASED_RULE = (

@@ -161,6 +161,10 @@ def test_the_last_v_before_an_m_is_part_of_its_settings(tmp_path):
     assert (found["settings"]["v"]["seed"], found["settings"]["m"]["seed"]) == (2, 3)
     assert [one["seed"] for one in found["stages_before"]] == [1]
     assert found["wall_time_s"] == 6
+    stages.append(stage(4, joined))  # M too went on from an earlier one
+    found = shipping._recipe(tmp_path / "none.json", "modular_1d", stage(3, joined), ["..."], stages)
+    assert (found["settings"]["v"]["seed"], found["settings"]["m"]["seed"]) == (2, 3)
+    assert [(one["model"], one["seed"]) for one in found["stages_before"]] == [("v", 1), ("m", 4)]
 
 
 def test_a_v_alone_may_be_the_stage_before(trained, package, dataset, tmp_path):
