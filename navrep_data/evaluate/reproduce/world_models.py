@@ -70,9 +70,8 @@ def _draw(found: list[Found], left_out: int) -> Any:
     _legend(figure, sorted({source_of(r.name) for r, _ in found}, key=_ORDER.index))
     r, about = found[0]
     note = f"{r.split} split of {about['data'].get('name')}, {r.rows:,} rows; each step is predicted from real ones."
-    if left_out:
-        note += f" {left_out} results of other data or splits are not drawn."
-    figure.supxlabel(note + " The authors' own values are known as a picture only.", fontsize=6.5)
+    other = f"{left_out} results of other data or splits are not drawn. " if left_out else ""
+    figure.supxlabel(f"{note}\n{other}The authors' own values are known as a picture only.", fontsize=6.5)
     return figure
 
 
@@ -82,7 +81,10 @@ def _bars(ax: Any, results: list[WorldModelError], kind: str) -> None:
     still = float(getattr(results[0], f"still_{kind}_mse"))
     for i, (r, value) in enumerate(zip(results, values, strict=True)):
         ax.bar(i, value, 0.7, color=COLOURS[source_of(r.name)], zorder=2)
-        ax.annotate(f"{value:.3g}", (i, value), (0, 2), textcoords="offset points", ha="center", fontsize=7)
+        ax.annotate(
+            f"{value:.3g}", (i, value), (0, 3), textcoords="offset points", ha="center", fontsize=7, zorder=4,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},
+        )  # fmt: skip
     ax.axhline(still, color="black", linestyle="--", linewidth=0.8, zorder=3)
     positive = [v for v in (*values, still) if v > 0]
     if max(positive) > 20 * min(positive):
