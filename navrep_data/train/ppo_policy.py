@@ -16,6 +16,8 @@ from navrep_data.train import passes
 from navrep_data.train.controller_recipe import MOST_STD
 from navrep_data.zoo.sb3 import EndToEndExtractor
 
+# Metres that the convolutions take for 1: about the lidar's range; a power of two brings weights back to the bit.
+_METRES = 32.0
 # Rows whose maps stay in the cache until the backward pass, in training as in rollouts.
 _CHUNK = 256
 
@@ -56,7 +58,7 @@ class BoundedPolicy(ActorCriticPolicy):
 
 
 class FastExtractor(EndToEndExtractor):
-    """The convolutions of an end-to-end network as training runs them: channels last, and in bfloat16 on request.
+    """The convolutions of an end-to-end network as training runs them: fast, and with ranges scaled.
 
     Parameters
     ----------
@@ -71,6 +73,7 @@ class FastExtractor(EndToEndExtractor):
     def __init__(self, observation_space: spaces.Box, lidar: str, precision: str) -> None:
         super().__init__(observation_space, lidar)
         self.dtype = passes.PRECISIONS[precision]
+        self.scale = 1.0 if lidar == "rings" else 1.0 / _METRES
 
     def forward(self, observations: Tensor) -> Tensor:
         """Return features of shape (B, 37)."""
@@ -79,6 +82,6 @@ class FastExtractor(EndToEndExtractor):
     def _features(self, observations: Tensor) -> Tensor:
         network = self.network
         obs, robot_state = network.split(observations)
-        x = passes.maps(network.encoder, obs, network.config.lidar, self.dtype)
+        x = passes.maps(network.encoder, obs * self.scale, network.config.lidar, self.dtype)
         x = functional.linear(x, network.fc.weight.to(self.dtype)).float() + network.fc.bias
         return torch.cat([x, robot_state], dim=-1)

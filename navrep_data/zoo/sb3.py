@@ -54,6 +54,28 @@ class EndToEndExtractor(BaseFeaturesExtractor):
         # the perceptrons are stable-baselines3's own
         for name in ("pi", "vf", "mean", "value", "q", "logstd"):
             delattr(self.network, name)
+        self.scale = 1.0
+        """What observations are multiplied by before the convolutions; the first one's weights are kept for it."""
+
+    def load(self, network: EndToEnd) -> None:
+        """Take the convolutions of a network, which reads observations as they are."""
+        self.network.encoder.load_state_dict(network.encoder.state_dict())
+        self.network.fc.load_state_dict(network.fc.state_dict())
+        with torch.no_grad():
+            self._first(self.network).weight /= self.scale
+
+    def store(self, network: EndToEnd) -> None:
+        """Give the convolutions to a network, which reads observations as they are."""
+        network.encoder.load_state_dict(self.network.encoder.state_dict())
+        network.fc.load_state_dict(self.network.fc.state_dict())
+        with torch.no_grad():
+            self._first(network).weight *= self.scale
+
+    @staticmethod
+    def _first(network: EndToEnd) -> nn.Conv2d:
+        first = network.encoder[0]
+        assert isinstance(first, nn.Conv2d)
+        return first
 
     def forward(self, observations: Tensor) -> Tensor:
         """Return features of shape (B, 37)."""
@@ -130,7 +152,7 @@ def put_weights(target: ActorCriticPolicy, network: ActorCritic) -> None:
     if isinstance(network, EndToEnd):
         extractor = target.features_extractor
         assert isinstance(extractor, EndToEndExtractor)
-        pairs += [(extractor.network.encoder, network.encoder), (extractor.network.fc, network.fc)]
+        extractor.load(network)
     for module, source in pairs:
         module.load_state_dict(source.state_dict())
     target.log_std.copy_(network.logstd)
@@ -148,7 +170,7 @@ def take_weights(network: ActorCritic, source: ActorCriticPolicy) -> None:
     if isinstance(network, EndToEnd):
         extractor = target.features_extractor
         assert isinstance(extractor, EndToEndExtractor)
-        pairs += [(network.encoder, extractor.network.encoder), (network.fc, extractor.network.fc)]
+        extractor.store(network)
     with torch.no_grad():
         for module, origin in pairs:
             module.load_state_dict(origin.state_dict())
