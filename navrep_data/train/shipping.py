@@ -192,7 +192,7 @@ def _recipe(
         )
     times = [t.seconds for t in (*before, training)]
     return {
-        **found,
+        **{name: value for name, value in found.items() if name != "stages_before"},  # of what was shipped before
         "commands": list(commands) or found["commands"],
         "settings": settings,
         **({"stages_before": earlier} if earlier else {}),
