@@ -222,6 +222,8 @@ def test_m_learns_the_way_back_from_its_dreams():
     assert real["z_error"] == pytest.approx(1 / 8)
     assert 0.3 < (dreamt["z_error"] - 1 / 8) / ((30 / 4 - 1) / 8) < 0.7
     assert real == memory_loss(memory, batch, recipe.replace(dream_share=0.0), noise=Noise.seeded(1))[0].parts
+    starts = {**batch, "restart": torch.ones(64, 4)}  # no row follows another: nothing to dream
+    assert memory_loss(memory, starts, recipe, noise=Noise.seeded(1))[0].parts["z_error"] == pytest.approx(1 / 8)
 
 
 def test_dreaming_costs_real_rows_nothing_and_teaches_all():
