@@ -13,6 +13,8 @@ from navrep_data.errors import ConfigError
 if TYPE_CHECKING:
     from navrep_data.train import Recipe, Trained
 
+_MOST_EPOCHS = 1_000_000
+
 train_app = typer.Typer(help="Train V, M, joint model, transformer or controllers.", no_args_is_help=True)
 
 Lidar = Annotated[str, typer.Option("--lidar", help="rings or 1d.")]
@@ -126,7 +128,7 @@ def _recipe(
     if file is not None:
         if original:
             raise ConfigError("--recipe and --original exclude each other: a recipe file says itself what it is.")
-        recipe = read_recipe(file)
+        recipe = read_recipe(file, model)
         if (recipe.model, recipe.lidar) != (model, lidar):
             raise ConfigError(
                 f"{file} is a recipe for {recipe.model} {recipe.lidar}, expected one for {model} {lidar}."
@@ -188,6 +190,8 @@ def _train(
     use_threads(threads)
     check_device(device)
     if epochs is not None:
+        if not 0.0 < epochs <= _MOST_EPOCHS:
+            raise ConfigError(f"--epochs is {epochs:g}, expected more than 0, and {_MOST_EPOCHS:,} at most.")
         per_epoch = Batches(open_dataset(data, recipe, "train", False), recipe).per_epoch
         recipe = recipe.replace(steps=max(1, round(epochs * per_epoch)))
     start = None

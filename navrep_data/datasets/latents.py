@@ -52,7 +52,10 @@ _COLUMNS: dict[str, tuple[str, int]] = {
 """Columns: dtype and numbers per row (0: one, without an axis; -1: the size of z)."""
 COPIED_COLUMNS = tuple(name for name in _COLUMNS if name not in ("mu", "logvar"))
 """Columns that are those of the source dataset."""
-_FIELDS = ("mu", "logvar", "robot_state", "action", "action_valid", "reward", "is_first", "is_last", "is_terminal")
+_FIELDS = (
+    "mu", "logvar", "robot_state", "goal_valid", "action", "action_valid", "reward", "is_first", "is_last",
+    "is_terminal",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -256,9 +259,10 @@ class LatentDataset(Dataset[Batch]):
 
     Notes
     -----
-    Fields: ``mu``, ``logvar`` (W, Z), ``robot_state`` (W, 5), ``action`` (W, 3), ``action_valid``, ``reward``,
-    ``is_first``, ``is_last``, ``is_terminal`` and ``mask`` (W,); rows past an episode's end are zero and ``mask`` is
-    False there. Draw z anew every epoch as ``mu + exp(logvar / 2) * noise``.
+    Fields: ``mu``, ``logvar`` (W, Z), ``robot_state`` (W, 5), ``goal_valid`` (W,), ``action`` (W, 3),
+    ``action_valid``, ``reward``, ``is_first``, ``is_last``, ``is_terminal`` and ``mask`` (W,); rows past an episode's
+    end are zero and ``mask`` is False there, and an unknown goal (imports) is zero with ``goal_valid`` False.
+    Draw z anew every epoch as ``mu + exp(logvar / 2) * noise``.
     """
 
     def __init__(

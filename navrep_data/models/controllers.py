@@ -19,6 +19,8 @@ from navrep_data.models.vae import FLAT_SIZE, as_images, convolutions
 from navrep_data.schema import ROBOT_STATE_SIZE
 
 N_ACTIONS = 2
+LEAST_STD, MOST_STD = 0.05, 0.6
+"""Widths of the distribution of bounded actions in training: the least unless a recipe says otherwise, the largest."""
 
 
 def _perceptron(n_inputs: int, n_hidden: int, activation: type[nn.Module]) -> nn.Sequential:

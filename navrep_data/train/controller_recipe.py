@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from navrep_data.errors import ConfigError
+from navrep_data.models.controllers import LEAST_STD, MOST_STD
 from navrep_data.sim import SimConfig, make_config
 from navrep_data.zoo.policy import FEATURES
 
@@ -14,9 +15,8 @@ VALIDATION_SEEDS = range(5000, 5100)
 """Episodes that selection looks at: never those of the test suite, 1000 to 1199."""
 AUTHORS_SEEDS = range(1000, 1100)
 AUTHORS_HELD_OUT = range(1100, 1200)
-MOST_STD = 0.6
-"""Largest width of the distribution of bounded actions."""
 PRECISIONS = ("int8", "bfloat16", "float32")
+_MOST = {"lr": 1.0, "gamma": 1.0, "gae_lambda": 1.0, "clip_range": 1.0}
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class ControllerRecipe:
     batch, epochs : int
         Rows per gradient step, passes over a rollout.
     lr : float
-        Learning rate; falls linearly to 0 unless original.
+        Learning rate; falls linearly to a fiftieth unless original.
     gamma, gae_lambda, clip_range, entropy, value_weight, max_grad_norm : float
         PPO's.
     target_kl : float
@@ -92,7 +92,7 @@ class ControllerRecipe:
     value_weight: float = 0.5
     max_grad_norm: float = 0.5
     target_kl: float = 0.03
-    least_std: float = 0.05
+    least_std: float = LEAST_STD
     hidden: int = 128
     max_speed: float = 1.0
     physics: str = "consistent"
@@ -120,8 +120,9 @@ class ControllerRecipe:
                 raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected a whole number of at least 1.")
             if field.type == "bool" and type(value) is not bool:
                 raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected true or false.")
-            if field.type == "float" and (type(value) not in (int, float) or not 0 <= value <= 1e6):
-                raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected a number of at least 0.")
+            most = _MOST.get(field.name, 1e6)
+            if field.type == "float" and (type(value) not in (int, float) or not 0 <= value <= most):
+                raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected a number from 0 to {most:g}.")
         if self.refit and self.features != "z":
             raise ConfigError(f"refit is for controllers on z, this is a recipe for {self.features}: leave it out.")
         if not 0.0 < self.least_std <= MOST_STD:
@@ -149,9 +150,9 @@ class ControllerRecipe:
 
 
 def default_controller_recipe(features: str, lidar: str) -> ControllerRecipe:
-    """Return our settings; end to end with fewer worlds, since its rollouts hold whole observations."""
+    """Return our settings; end to end with smaller steps, since its encoder learns at the same time."""
     if features == "e2e":
-        return ControllerRecipe(features, lidar, worlds=128, rollout=64, batch=1024, lr=3e-4, hidden=64)
+        return ControllerRecipe(features, lidar, lr=3e-4)
     return ControllerRecipe(features, lidar, precision="int8")
 
 

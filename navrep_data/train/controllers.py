@@ -13,7 +13,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from navrep_data._version import __version__
-from navrep_data.errors import ConfigError, TrainingError
+from navrep_data.errors import CheckpointError, ConfigError, TrainingError
 from navrep_data.io import atomic_write_json
 from navrep_data.models import Controller, EndToEnd, checkpoint
 from navrep_data.schema import Event, SensorContract
@@ -39,13 +39,14 @@ from navrep_data.train.learner import (
 )
 from navrep_data.train.logs import Logger, curve
 from navrep_data.train.refit import refit
-from navrep_data.train.world_models import claim, machine
+from navrep_data.train.world_models import claim, machine, unclaimed_if_refused
 from navrep_data.train.worlds import play
 from navrep_data.zoo.local import PARTS, POLICY_FILE
 from navrep_data.zoo.policy import Policy
 from navrep_data.zoo.sb3 import put_weights, take_weights
 
 _LEAST_RATE = 0.02
+HELD_OUT_FILE = "held_out.json"
 
 
 @dataclass(frozen=True)
@@ -99,14 +100,14 @@ def train_controller(
     model_name : str
         Its name or folder, for the record.
     init : Policy, optional
-        Go on from this policy's controller; its own bounds and sizes are kept.
+        Go on from this policy's controller; its own bounds and sizes are kept. Not needed to resume.
     resume : bool
         Go on from the last checkpoint in `out`, to the same weights as without the interruption: at every checkpoint
         all worlds start anew, as difficult as they were.
     stop_after : int, optional
         Stop, with a checkpoint, after this many steps.
     device : str
-        Of learner and encoder.
+        Of the learner; worlds and the frozen encoder stay on the CPU.
     progress : bool
         Show a progress bar on stderr.
     report : callable, optional
@@ -125,13 +126,14 @@ def train_controller(
     """
     out = Path(out)
     torch.manual_seed(recipe.seed)
-    network = _first_network(recipe, model, init, resume, report)
+    folder = state.last_folder(out) if resume else None
+    network = _saved_network(folder, recipe, model) if folder else _first_network(recipe, model, init, resume, report)
     used = None if recipe.features == "e2e" else weights_hash(model)
-    claim(
-        out, recipe.to_dict(), {"world_model": model_name, "world_model_sha256": used}, resume, free=("validate_every",)
-    )
+    data = {"world_model": model_name, "world_model_sha256": used, "init": None if init is None else init.name}
+    claim(out, recipe.to_dict(), data, resume, free=("validate_every",))
     with writer_lock(out):
-        run = _Run(recipe, out, network, model, model_name, init is not None, resume, device)
+        with unclaimed_if_refused(out, resume):
+            run = _Run(recipe, out, network, model, model_name, init is not None, folder, device)
         return run.train(recipe.steps if stop_after is None else min(stop_after, recipe.steps), progress, report)
 
 
@@ -154,6 +156,18 @@ def _first_network(
     return network
 
 
+def _saved_network(folder: Path, recipe: ControllerRecipe, model: Any) -> Controller | EndToEnd:
+    """Return the network of a checkpoint, of whatever sizes and bounds ``--init`` gave it."""
+    wanted = make_network(recipe, model)  # whose checks hold here too
+    network = checkpoint.load(folder)
+    if not isinstance(network, Controller | EndToEnd) or type(network) is not type(wanted):
+        raise CheckpointError(
+            f"{folder} holds a {type(network).__name__}, expected a {type(wanted).__name__}: start anew in another "
+            "folder."
+        )
+    return network
+
+
 def _stream(recipe: ControllerRecipe, step: int) -> int:
     """Return the seed of worlds and noise from a step on."""
     return int(np.random.SeedSequence([recipe.seed, step]).generate_state(1, np.uint32)[0])
@@ -164,14 +178,13 @@ class _Run(BaseCallback):
 
     def __init__(
         self, recipe: ControllerRecipe, out: Path, network: Controller | EndToEnd, model: Any, model_name: str,
-        pretrained: bool, resume: bool, device: str,
+        pretrained: bool, folder: Path | None, device: str,
     ) -> None:  # fmt: skip
         super().__init__()
         self.recipe, self.out, self.network, self.model_name = recipe, out, network, model_name
         self.encoder = make_encoder(recipe, model)
         self.policy_now = make_policy(recipe, network, model, model_name, self.encoder)
         self.at = state.Progress()
-        folder = state.last_folder(out) if resume else None
         done = state.read_step(folder) if folder is not None else 0
         self.worlds = make_worlds(recipe, network, model, self.encoder, _stream(recipe, done))
         if recipe.easy_start:
@@ -179,6 +192,7 @@ class _Run(BaseCallback):
         self.ppo = make_ppo(recipe, self.worlds, network, device)
         if folder is not None:
             self.at = state.load(folder, network, self.ppo.policy.optimizer, self.ppo.policy)
+            state.publish(out, self.at.best_step)  # in case the last run was stopped before it could
             if "difficulty" in self.at.extra:
                 self.worlds.set_difficulty(self.at.extra["difficulty"].cpu().numpy())
         if folder is not None or pretrained:
@@ -190,7 +204,7 @@ class _Run(BaseCallback):
         self.spent, self.began, self.first = 0.0, 0.0, self.at.step
         self.stop_at = recipe.steps
         self.bar: Any = None
-        if model is not None and not (out / PARTS).exists():
+        if model is not None and not (out / PARTS / checkpoint.CONFIG_NAME).is_file():  # which is written last
             checkpoint.save(model, out / PARTS, {"name": model_name})
         atomic_write_json(out / POLICY_FILE, self._description())
 
@@ -232,13 +246,30 @@ class _Run(BaseCallback):
             self.logger_file.close()
             self.worlds.close()
         rate = (self.at.step - self.first) / max(1e-9, self.spent)
-        held_out = self._success(AUTHORS_HELD_OUT) if self.recipe.original else None
+        held_out = self._held_out() if self.recipe.original else None
         best = 0.0 if self.at.best is None else 1.0 - self.at.best
         if report is not None:
             more = "" if held_out is None else f", {held_out:.1%} on episodes 1100 to 1199"
             report(f"{self.out}: {self.at.step:,} steps, {rate:,.0f} steps/s, best validation {best:.1%}{more}")
         curve(self.out)
         return TrainedController(self.out, self.at.step, best, rate, held_out)
+
+    def _held_out(self) -> float | None:
+        """Return the success of the selected controller on episodes that its selection did not look at."""
+        folder = state.last_folder(self.out)
+        if folder is None:
+            return None
+        best: Any = checkpoint.load(state.folder_of(self.out, self.at.best_step))
+        rate = self._success(AUTHORS_HELD_OUT, best)
+        atomic_write_json(
+            self.out / HELD_OUT_FILE,
+            {
+                "success_rate": rate, "step": self.at.best_step,
+                "episodes": f"navrep-test, original physics, numpy seeds {AUTHORS_HELD_OUT.start} to "
+                f"{AUTHORS_HELD_OUT.stop - 1}",
+            },
+        )  # fmt: skip
+        return rate
 
     def _learn(self, steps: int) -> None:
         try:
@@ -254,7 +285,8 @@ class _Run(BaseCallback):
         last = state.last_folder(self.out)
         kept = f"The last good checkpoint is {last}" if last is not None else "There is no checkpoint yet"
         raise TrainingError(
-            f"Weights are NaN after {self.ppo.num_timesteps:,} steps, expected finite ones. {kept}; lower lr."
+            f"Weights are NaN after {self.ppo.num_timesteps:,} steps, expected finite ones. {kept}; start in "
+            "another folder with a lower lr (--set lr=...), from that checkpoint by --init."
         )
 
     # --- callback ----------------------------------------------------------------------------------------------
@@ -332,9 +364,9 @@ class _Run(BaseCallback):
         state.publish(self.out, self.at.best_step)
         self.began = time.perf_counter()
 
-    def _success(self, seeds: range) -> float:
+    def _success(self, seeds: range, network: Controller | EndToEnd | None = None) -> float:
         """Return the share of validation episodes that end at the goal; the policy acts by its mean."""
-        network = self.network
+        network = self.network if network is None else network
         exact = self.recipe.replace(precision="float32")
         policy = make_policy(exact, network, self.policy_now.world_model or self.policy_now.vae)
         ended = play(policy, validation_environment(), seeds)

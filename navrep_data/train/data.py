@@ -170,8 +170,8 @@ def prepare(raw: Batch, recipe: Recipe) -> Batch:
     Returns
     -------
     dict of str to Tensor
-        v: `obs` (B, ...). Others: `mask`, `next_mask` (B, T), `goal`, `next_goal`, `action`; lidar models `obs` and
-        `next_obs` (B, T, ...); m `mu`, `logvar` of T + 1 rows, `restart`, `next_last`.
+        v: `obs` (B, ...). Others: `mask`, `next_mask` (B, T), `goal`, `next_goal`, `goal_mask` (both known), `action`;
+        lidar models `obs` and `next_obs` (B, T, ...); m `mu`, `logvar` of T + 1 rows, `restart`, `next_last`.
     """
     if recipe.model == "m":
         return _prepare_codes(raw, recipe)
@@ -208,6 +208,7 @@ def _prepare_codes(raw: Batch, recipe: Recipe) -> Batch:
         "next_mask": raw["mask"][:, 1:],
         "goal": raw["robot_state"][:, :-1, :2],
         "next_goal": raw["robot_state"][:, 1:, :2],
+        "goal_mask": raw["mask"][:, 1:] & raw["goal_valid"][:, 1:] & raw["goal_valid"][:, :-1],
         "action": raw["action"][:, :-1],
         # the authors restart the state on an episode's last row; windows within episodes hold no restart
         "restart": last[:, :-1] & recipe.original,

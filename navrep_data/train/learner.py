@@ -21,9 +21,10 @@ from navrep_data.sim import Simulator
 from navrep_data.train.controller_recipe import ControllerRecipe, environment
 from navrep_data.train.encode import vae_of
 from navrep_data.train.ppo import GroupedPPO
-from navrep_data.train.ppo_policy import BoundedPolicy, FastExtractor
+from navrep_data.train.ppo_policy import FastExtractor
 from navrep_data.train.worlds import TrainingWorlds, WorldGroups
 from navrep_data.zoo.policy import Policy
+from navrep_data.zoo.sb3 import BoundedPolicy
 
 _CODES = 0.2
 _WORTH_A_GROUP = 64
@@ -146,7 +147,11 @@ def make_ppo(recipe: ControllerRecipe, worlds: WorldGroups, network: Controller 
         kwargs |= {
             "activation_fn": nn.ReLU,
             "features_extractor_class": FastExtractor,
-            "features_extractor_kwargs": {"lidar": recipe.lidar, "precision": _floats(recipe)},
+            "features_extractor_kwargs": {
+                "lidar": recipe.lidar,
+                "precision": _floats(recipe),
+                "scaled": not recipe.original,
+            },
         }
     kind: type[ActorCriticPolicy] = ActorCriticPolicy
     algorithm = PPO

@@ -268,8 +268,8 @@ def memory_loss(
     memory : MDNRNN
         M.
     batch : dict
-        `z`, `next_z` (B, T, Z), `goal`, `next_goal` (B, T, 2) [m], `action` (B, T, 3), `restart`, `next_last` (B, T)
-        and `next_mask` (B, T).
+        `z`, `next_z` (B, T, Z), `goal`, `next_goal` (B, T, 2) [m], `action` (B, T, 3), `restart`, `next_last` (B, T),
+        `next_mask` (B, T), and `goal_mask` (B, T), where both goals are known: elsewhere only z counts.
     recipe : Recipe
         Settings.
     state : pair of Tensor, optional
@@ -287,8 +287,11 @@ def memory_loss(
     change = torch.cat([batch["next_z"] - z, (batch["next_goal"] - goal) / RANGE_MAX], dim=-1)
     where = batch["next_mask"].to(h.dtype)
     n = where.sum().clamp_min(1.0)
+    with_goal = batch["goal_mask"].to(h.dtype)
     each = mixture_nll(mixture, change)
-    nll = (each.mean(-1) * where).sum() / n
+    of_goal = each[..., -GOAL_SIZE:].sum(-1) * with_goal
+    each = (each[..., :-GOAL_SIZE].sum(-1) + of_goal) / (each.shape[-1] - GOAL_SIZE + GOAL_SIZE * with_goal)
+    nll = (each * where).sum() / n
     restart = restart_loss(mixture.restart_logit, batch["next_last"].to(h.dtype), recipe.restart_factor)
     restart = (restart * where).sum() / n
     error = (mixture.likeliest() - change).detach()
@@ -296,7 +299,9 @@ def memory_loss(
         "nll": nll,
         "restart": restart,
         "z_error": (error[..., :-GOAL_SIZE].square().mean(-1) * where).sum() / n,
-        "goal_error_m2": (error[..., -GOAL_SIZE:].square().mean(-1) * where).sum() / n * RANGE_MAX**2,
+        "goal_error_m2": (error[..., -GOAL_SIZE:].square().mean(-1) * with_goal).sum()
+        / with_goal.sum().clamp_min(1.0)
+        * RANGE_MAX**2,
     }
     return Terms(nll + restart, {name: float(value.detach()) for name, value in parts.items()}), after
 

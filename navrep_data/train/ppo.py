@@ -20,8 +20,8 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.utils import explained_variance
 from torch import Tensor, nn
 
-from navrep_data.train.ppo_policy import BoundedPolicy
 from navrep_data.train.worlds import TrainingWorlds, WorldGroups
+from navrep_data.zoo.sb3 import BoundedPolicy
 
 _LOG_2_PI = math.log(2.0 * math.pi)
 _TOO_FAR = 1.5

@@ -36,6 +36,8 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "clip_value": (0.0, 1e6),
     "kl_weight": (0.0, 100.0),
     "kl_floor": (0.0, 1e6),
+    "kl_warmup": (0, 10**9),
+    "epsilon": (1e-16, 1.0),
     "goal_scale": (0.01, 1000.0),
     "dropout": (0.0, 0.9),
     "reconstruct_share": (0.01, 1.0),
@@ -301,8 +303,15 @@ def shipped_recipes() -> dict[str, dict[str, Any]]:
     return {f.name.removesuffix(".json"): json.loads(f.read_bytes()) for f in sorted(files, key=lambda f: f.name)}
 
 
-def read_recipe(path: Path | str) -> Recipe:
+def read_recipe(path: Path | str, model: str | None = None) -> Recipe:
     """Read the settings of a recipe file: the object under ``settings``, or the whole file.
+
+    Parameters
+    ----------
+    path : path-like
+        File.
+    model : str, optional
+        Which part of a modular recipe: ``"v"`` or ``"m"``.
 
     Raises
     ------
@@ -312,4 +321,8 @@ def read_recipe(path: Path | str) -> Recipe:
     found = read_json(path, _MAX_RECIPE_BYTES)
     if isinstance(found, dict) and "settings" in found:
         found = found["settings"]
+    if isinstance(found, dict) and set(found) == {"v", "m"}:
+        if model not in found:
+            raise ConfigError(f"{path} is a recipe for V and M, expected one for {model or 'one model'}.")
+        found = found[model]
     return Recipe.from_dict(found)

@@ -89,6 +89,8 @@ def refit(init: Policy, vae: VAE, config: SimConfig) -> tuple[Controller, float]
     CheckpointError
         If the policy has other features.
     """
+    if not isinstance(init, Policy):
+        raise CheckpointError(f"--init is a {type(init).__name__}, expected a policy such as transformer_rings_z.v1.")
     if init.features != "z" or init.vae is None or not isinstance(init.network, Controller):
         raise CheckpointError(
             f"refit brings controllers on z to another V, --init {init.name} takes {init.features or 'observations'}: "

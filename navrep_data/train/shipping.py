@@ -9,6 +9,7 @@ benchmark`` and ``navrep-data evaluate world-model --out`` measured of the shipp
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 import torch
 
 from navrep_data.errors import CheckpointError, ConfigError
-from navrep_data.io import atomic_write_json, read_json, sha256_file
+from navrep_data.io import atomic_write_bytes, atomic_write_json, read_json, sha256_file
 from navrep_data.models import EndToEnd, WorldModel, checkpoint
 from navrep_data.models.vae import n_parameters
 from navrep_data.schema import SensorContract
@@ -105,17 +106,26 @@ def ship(
     target = root / registry.WEIGHTS / name
     network: Any = training.policy.network if training.policy is not None else training.model
     kept = {key: training.metadata[key] for key in _KEPT if key in training.metadata}
-    checkpoint.save(network, target, kept, storage=STORAGE)
-    files = tuple(
-        FileEntry(f"{registry.WEIGHTS}/{name}/{path.name}", path.stat().st_size, sha256_file(path), None)
-        for path in checkpoint.paths(target)
-    )
-    total = sum(path.stat().st_size for path in (root / registry.WEIGHTS).rglob("*") if path.is_file())
-    if total > SHIPPED_BYTES:
-        raise ConfigError(f"The shipped weights take {total:,} bytes with {name}, expected {SHIPPED_BYTES:,} at most.")
-    reference: Any = training.policy or training.model
-    cost = rounding(reference, _rounded(training, target, root, parts), Path(data))
-    record = _record(variant, training, parts, files, recipe, cost)
+    others = (path for path in (root / registry.WEIGHTS).rglob("*") if path.is_file() and target not in path.parents)
+    total = sum(path.stat().st_size for path in others)
+    with tempfile.TemporaryDirectory() as made:  # what is shipped stays as it is until all checks have passed
+        new = Path(made) / name
+        checkpoint.save(network, new, kept, storage=STORAGE)
+        files = tuple(
+            FileEntry(f"{registry.WEIGHTS}/{name}/{path.name}", path.stat().st_size, sha256_file(path), None)
+            for path in checkpoint.paths(new)
+        )
+        total += sum(file.bytes or 0 for file in files)
+        if total > SHIPPED_BYTES:
+            raise ConfigError(
+                f"The shipped weights take {total:,} bytes with {name}, expected {SHIPPED_BYTES:,} at most."
+            )
+        reference: Any = training.policy or training.model
+        cost = rounding(reference, _rounded(training, new, root, parts), Path(data))
+        record = _record(variant, training, parts, files, recipe, cost)
+        target.mkdir(parents=True, exist_ok=True)
+        for path in checkpoint.paths(new):
+            atomic_write_bytes(target / path.name, path.read_bytes())
     atomic_write_json(root / registry.RECORDS / f"{name}.json", record.to_dict())
     atomic_write_json(recipes / f"{variant}.json", recipe)
     for cached in (registry.records, registry.variants, registry.full_names):

@@ -184,13 +184,16 @@ def load(
         said = " ".join(str(error).split())[:160]  # it may repeat what it read
         raise CheckpointError(f"{path} is not a safetensors file ({said}).") from error
     by_name = dict((trained or model).named_parameters())
+    fused = {p for group in optimizer.param_groups if group.get("fused") for p in group["params"]}
     for key, tensor in tensors.items():
         if key.startswith("optimizer/"):
             name, _, what = key.removeprefix("optimizer/").rpartition("/")
             if name not in by_name or tensor.shape not in (by_name[name].shape, ()):
                 raise CheckpointError(f"{path} has a state of {name[:60]!r}, unknown in this network.")
-            # torch keeps the step counter on the CPU
-            optimizer.state[by_name[name]][what] = tensor if what == "step" else tensor.to(device)
+            parameter = by_name[name]
+            # torch keeps the step counter on the CPU, unless it updates in one pass
+            stays = what == "step" and parameter not in fused
+            optimizer.state[parameter][what] = tensor if stays else tensor.to(parameter.device)
     extra = {k.removeprefix("extra/"): t.to(device) for k, t in tensors.items() if k.startswith("extra/")}
     return replace(progress, extra=extra)
 

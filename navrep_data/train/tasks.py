@@ -153,7 +153,11 @@ class WorldModelTask:
             squared = (torch.sigmoid(pred) - piece["next_obs"]).square().flatten(1).mean(1)
             sums["pred_mse"] += float(squared.sum())
             sums["pred_loss"] += float(observation_loss(pred, piece["next_obs"], recipe.reconstruction).sum())
-            sums["goal_mse_m2"] += float((next_goal - piece["next_goal"])[next_mask].square().mean(-1).sum())
+            goal_mask = piece["goal_mask"]
+            known = float(goal_mask.sum())
+            off = float((next_goal - piece["next_goal"])[goal_mask].square().mean(-1).sum())
+            # rows whose goal is unknown count as the others' mean
+            sums["goal_mse_m2"] += off * float(next_mask.sum()) / max(1.0, known)
         sums["error"] = sums["pred_mse"]
         return sums, float(batch["next_mask"].sum())
 

@@ -6,7 +6,8 @@ import math
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from navrep_data.models import (
     VAEConfig,
     WorldModel,
 )
-from navrep_data.shards import writer_lock
+from navrep_data.shards import LOCK_FILE, writer_lock
 from navrep_data.train import state
 from navrep_data.train.cues import Cues
 from navrep_data.train.cues import wanted as cues_wanted
@@ -151,7 +152,8 @@ def train_world_model(
         recipe = recipe.replace(z_size=LatentManifest.read(data).z_size)
     claim(out, recipe.to_dict(), described, resume)
     with writer_lock(out):
-        loop = _Loop(recipe, data, out, described, torch.device(device), init, preload)
+        with unclaimed_if_refused(out, resume):
+            loop = _Loop(recipe, data, out, described, torch.device(device), init, preload)
         return loop.run(recipe.steps if stop_after is None else min(stop_after, recipe.steps), progress, report)
 
 
@@ -181,7 +183,7 @@ def claim(
     path = out / state.RECIPE_FILE
     here = {"settings": settings, "data": data, "version": __version__}
     if not resume:
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        if out.exists() and (not out.is_dir() or any(path.name != LOCK_FILE for path in out.iterdir())):
             raise FolderInUseError(
                 f"{out} is not empty and is not overwritten: go on with --resume, or choose another folder with --out."
             )
@@ -207,6 +209,17 @@ def claim(
             raise DatasetMismatchError(
                 f"{out} was trained on other data ({name} differs): resume with those it was started with."
             )
+
+
+@contextmanager
+def unclaimed_if_refused(out: Path, resume: bool) -> Iterator[None]:
+    """Take :func:`claim`'s recipe away again where a new training is refused before it began: the folder stays free."""
+    try:
+        yield
+    except BaseException:
+        if not resume:
+            (out / state.RECIPE_FILE).unlink(missing_ok=True)
+        raise
 
 
 class _Loop:
@@ -244,6 +257,7 @@ class _Loop:
                 head = {name: self.progress.extra.pop(f"cues.{name}") for name in ("weight", "bias")}
                 self.cues.load_state_dict(head)
             self.task.extra = self.progress.extra
+            self._publish()  # in case the last run was stopped before it could
         self.train = Batches(open_dataset(data, recipe, "train", preload), recipe)
         self.valid = self._validation(data, preload)
         self.validation: dict[str, float] = {}
@@ -327,7 +341,8 @@ class _Loop:
         epoch, k = divmod(at, self.train.per_epoch)
         raise TrainingError(
             f"The loss is {value} at step {at + 1} (epoch {epoch}, batch {k}; first in: {', '.join(bad)}). {kept}; "
-            "lower --lr, set --precision float32, or verify the dataset."
+            "verify the dataset, or start in another folder, from that checkpoint by --init, with --set lr=... lower "
+            "or --set precision=float32."
         )
 
     def _housekeeping(self, stop: int, logger: Logger, batch: Any) -> None:
@@ -343,8 +358,12 @@ class _Loop:
             at.extra = {**self.task.extra, **head}
             state.save(self.out, self.model, self.optimizer, at, self._metadata(), self.trained)
             state.commit(self.out, at)
-            # the authors used what training ended with
-            state.publish(self.out, at.step if recipe.original or at.best is None else at.best_step)
+            self._publish()
+
+    def _publish(self) -> None:
+        at = self.progress
+        # the authors used what training ended with
+        state.publish(self.out, at.step if self.recipe.original or at.best is None else at.best_step)
 
     @torch.no_grad()
     def _validate(self, logger: Logger) -> bool:

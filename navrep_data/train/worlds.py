@@ -302,11 +302,13 @@ class WorldGroups(_Batch):
             group.set_difficulty(difficulty[worlds])
 
     def take_outcomes(self) -> dict[str, float]:
-        """Return the shares of the outcomes since the last call, and forget them."""
+        """Return the shares of the outcomes since the last call, and forget them; no shares where no episode ended."""
         events = [event for group in self.groups for event in group.take_outcomes()]
-        n = max(1, len(events))
+        n = len(events)
+        if n == 0:
+            return {"episodes": 0.0}
         return {
-            "episodes": float(len(events)),
+            "episodes": float(n),
             "success": sum(e == Event.GOAL for e in events) / n,
             "collision": sum(e in (Event.COLLISION_HUMAN, Event.COLLISION_OBSTACLE) for e in events) / n,
             "timeout": sum(e == Event.TIMEOUT for e in events) / n,

@@ -1,19 +1,21 @@
-"""Released controllers as stable-baselines3 PPO models, to predict with and to train on."""
+"""Controllers as stable-baselines3 PPO models, to predict with and to train on."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
 from stable_baselines3 import PPO
+from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
 from navrep_data.models.config import EndToEndConfig
-from navrep_data.models.controllers import ActorCritic, EndToEnd
+from navrep_data.models.controllers import LEAST_STD, MOST_STD, ActorCritic, EndToEnd, limit_speed
 from navrep_data.schema import ROBOT_STATE_SIZE
 from navrep_data.zoo.policy import Policy
 
@@ -34,6 +36,61 @@ HYPERPARAMETERS: dict[str, Any] = {
 }
 # stable-baselines 2's Adam; torch's default is 1e-8
 _ADAM_EPS = 1e-5
+
+
+class BoundedPolicy(ActorCriticPolicy):
+    """A normal distribution whose mean is within (-1, 1) and whose width stays between `least_std` and 0.6.
+
+    Parameters
+    ----------
+    observation_space, action_space, *args, **kwargs
+        As in stable-baselines3.
+    least_std : float
+        Smallest width.
+    max_speed : float
+        ``predict`` shortens velocities to this [m/s]; 0 = no limit. What is sampled for training is left as it is, so
+        that its density is known: there the environment limits.
+
+    Notes
+    -----
+    The released controllers' means and widths had no bounds while the environment clipped what it executed: with an
+    entropy bonus both grew into the hundreds, and control became bang-bang (MODEL_FACTS 7).
+    """
+
+    def __init__(
+        self,
+        observation_space: gymnasium.spaces.Space[Any],
+        action_space: gymnasium.spaces.Space[Any],
+        *args: Any,
+        least_std: float = LEAST_STD,
+        max_speed: float = 0.0,
+        **kwargs: Any,
+    ):
+        self._bounds = math.log(least_std), math.log(MOST_STD)
+        self.max_speed = max_speed
+        kwargs.setdefault("log_std_init", math.log(0.4))
+        super().__init__(observation_space, action_space, *args, **kwargs)
+        self.optimizer.register_step_post_hook(lambda *_: self.bound_width())
+
+    @torch.no_grad()
+    def bound_width(self) -> None:
+        """Bring the width back within its bounds; happens by itself after every step of the optimiser.
+
+        The parameter itself is moved, since one that lies outside of a clamp has no gradient that would bring it back.
+        """
+        self.log_std.clamp_(*self._bounds)
+
+    def heads(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return means (N, A), log widths (A,) and values (N,) of observations (N, F)."""
+        latent_pi, latent_vf = self.mlp_extractor(self.extract_features(obs))
+        return torch.tanh(self.action_net(latent_pi)), self.log_std, self.value_net(latent_vf).squeeze(1)
+
+    def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Distribution:
+        assert isinstance(self.action_dist, DiagGaussianDistribution)
+        return self.action_dist.proba_distribution(torch.tanh(self.action_net(latent_pi)), self.log_std)
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
+        return limit_speed(super()._predict(observation, deterministic), self.max_speed)
 
 
 class EndToEndExtractor(BaseFeaturesExtractor):
@@ -106,17 +163,21 @@ def to_sb3(policy: Policy, env: Any = None, **options: Any) -> PPO:
     Returns
     -------
     stable_baselines3.PPO
-        ``predict(features, deterministic=True)`` gives the mean clipped to [-1, 1].
+        ``predict(features, deterministic=True)`` gives what ``policy.act`` executes: the mean clipped to [-1, 1]; of
+        our own controllers (a :class:`BoundedPolicy`) its tanh, shortened to their speed limit.
 
     Notes
     -----
     Released runs: stable-baselines 2.10 PPO2. The unused state-action value is left out; the optimiser starts anew.
+    An environment to train our own controllers in should shorten velocities to ``policy.network.config.max_speed``
+    itself.
     """
     observation_space, action_space = spaces(policy)
     n_envs = options.pop("n_envs", N_ENVS)
     settings = {**HYPERPARAMETERS, "device": "cpu", **options}
     settings.setdefault("policy_kwargs", _policy_kwargs(policy.network))
-    model = PPO(ActorCriticPolicy, env, _init_setup_model=False, **settings)
+    kind = BoundedPolicy if policy.network.config.squash == "tanh" else ActorCriticPolicy
+    model = PPO(kind, env, _init_setup_model=False, **settings)
     if env is None:
         model.observation_space, model.action_space, model.n_envs = observation_space, action_space, n_envs
     model._setup_model()
@@ -131,6 +192,8 @@ def _policy_kwargs(network: ActorCritic) -> dict[str, Any]:
         "activation_fn": nn.Tanh,
         "optimizer_kwargs": {"eps": _ADAM_EPS},
     }
+    if network.config.squash == "tanh":
+        kwargs["max_speed"] = network.config.max_speed
     if isinstance(network, EndToEnd):
         kwargs |= {
             "activation_fn": nn.ReLU,
@@ -156,6 +219,8 @@ def put_weights(target: ActorCriticPolicy, network: ActorCritic) -> None:
     for module, source in pairs:
         module.load_state_dict(source.state_dict())
     target.log_std.copy_(network.logstd)
+    if isinstance(target, BoundedPolicy):
+        target.bound_width()
 
 
 def take_weights(network: ActorCritic, source: ActorCriticPolicy) -> None:

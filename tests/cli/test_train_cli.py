@@ -68,6 +68,8 @@ def test_v_codes_m_and_their_error(dataset, tmp_path, capsys):
         (["--init", "no_such_model"], "Unknown model"),
         (["--resume"], "no training to resume"),
         (["--lidar", "2d"], "lidar is '2d'"),
+        (["--epochs", "nan"], "--epochs is nan, expected more than 0"),
+        (["--epochs", "-3"], "--epochs is -3, expected more than 0"),
     ],
 )
 def test_errors_are_one_line(arguments, words, dataset, tmp_path, capsys):

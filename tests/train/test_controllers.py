@@ -1,5 +1,7 @@
 """Controllers: the batch of worlds, PPO for a few steps, what it leaves, bad input."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -23,6 +25,7 @@ from navrep_data.train.state import last_folder
 from navrep_data.train.worlds import TrainingWorlds, WorldGroups, play, shorten
 from navrep_data.zoo.local import load_any_model
 from navrep_data.zoo.policy import Policy
+from navrep_data.zoo.sb3 import put_weights
 
 SMALL = {"worlds": 8, "rollout": 8, "batch": 32, "steps": 128, "validate_every": 64}
 
@@ -149,7 +152,7 @@ def test_worlds_start_easy_or_hard(easy, expected, few_episodes, tmp_path):
     recipe = default_controller_recipe("z", "1d").replace(**SMALL, easy_start=easy)
     model = world_model()
     network = controllers.make_network(recipe, model)
-    run = controllers._Run(recipe, tmp_path / "c", network, model, "W", False, False, "cpu")
+    run = controllers._Run(recipe, tmp_path / "c", network, model, "W", False, None, "cpu")
     assert (run.worlds.difficulty() == expected).all()
 
 
@@ -162,9 +165,21 @@ def test_the_width_of_actions_stays_within_its_bounds(least, few_episodes, tmp_p
     policy = learner.make_ppo(recipe, worlds, network, "cpu").policy
     for log_std, expected in ((-9.0, least), (np.log(0.4), 0.4), (9.0, 0.6)):
         with torch.no_grad():
-            policy.log_std.fill_(log_std)
-            width = policy.get_distribution(torch.zeros(2, policy.observation_space.shape[0])).distribution.stddev
-        np.testing.assert_allclose(width, expected, rtol=1e-5)
+            network.logstd.fill_(log_std)
+        put_weights(policy, network)
+        obs = torch.zeros(2, policy.observation_space.shape[0])
+        width = policy.get_distribution(obs).distribution.stddev
+        np.testing.assert_allclose(width.detach(), expected, rtol=1e-5)
+        for wish in (-1.0, 1.0):  # from its bounds it finds the way back, and no step leads beyond them
+            policy.optimizer.zero_grad()
+            (-wish * policy.heads(obs)[1].sum()).backward()
+            assert (policy.log_std.grad != 0).all()
+            for group in policy.optimizer.param_groups:
+                group["lr"] = 0.1
+            policy.optimizer.step()
+            assert (policy.log_std.exp() <= 0.6 + 1e-6).all()
+            assert (policy.log_std.exp() >= least - 1e-6).all()
+        assert (policy.log_std.exp() > least).all()
     with pytest.raises(ConfigError, match="least_std is 0"):
         recipe.replace(least_std=0.0)
 
@@ -318,7 +333,9 @@ def test_nan_stops_and_keeps_the_last_good_checkpoint(few_episodes, tmp_path, mo
 
     monkeypatch.setattr(TrainingWorlds, "advance", poisoned)
     recipe = default_controller_recipe("z", "1d").replace(**SMALL)
-    with pytest.raises(TrainingError, match=r"Weights are NaN after 128 steps.*step-00000064; lower lr") as error:
+    with pytest.raises(
+        TrainingError, match=r"Weights are NaN after 128 steps.*step-00000064; start in another folder with a lower lr"
+    ) as error:
         controllers.train_controller(recipe, tmp_path / "c", model=world_model())
     assert "\n" not in str(error.value)
     assert last_folder(tmp_path / "c").name == "step-00000064"
@@ -326,7 +343,7 @@ def test_nan_stops_and_keeps_the_last_good_checkpoint(few_episodes, tmp_path, mo
 
 
 @pytest.mark.slow
-def test_the_authors_settings_run_and_report_the_episodes_they_did_not_select_on(few_episodes, tmp_path):
+def test_the_authors_settings_run_and_report_the_episodes_they_did_not_select_on(few_episodes, tmp_path, monkeypatch):
     recipe = original_controller_recipe("z", "1d")
     assert (recipe.worlds, recipe.rollout, recipe.batch, recipe.entropy, recipe.steps) == (
         6,
@@ -336,9 +353,26 @@ def test_the_authors_settings_run_and_report_the_episodes_they_did_not_select_on
         60_000_000,
     )
     short = recipe.replace(rollout=32, validate_every=192, steps=192)
+    heard, said = [], iter([0.9, 0.1, 0.4])  # two validations, of which the first is selected; then what is held out
+
+    def play(policy, _, seeds):
+        heard.append((seeds, {name: p.clone() for name, p in policy.network.named_parameters()}))
+        goals = round(10 * next(said))
+        return [Event.GOAL] * goals + [Event.TIMEOUT] * (10 - goals)
+
+    monkeypatch.setattr(controllers, "play", play)
+    short = short.replace(steps=384)
     done = controllers.train_controller(short, tmp_path / "c", model=world_model(alignment="leading"))
-    assert done.held_out is not None
-    assert checkpoint.load(tmp_path / "c").config.squash == "clip"
+    assert (done.best, done.held_out) == (pytest.approx(0.9), 0.4)
+    assert [seeds.start for seeds, _ in heard] == [1000, 1000, 1100]
+    selected = checkpoint.load(tmp_path / "c")
+    assert selected.config.squash == "clip"
+    for name, p in selected.named_parameters():
+        assert torch.equal(p, heard[0][1][name])
+        assert torch.equal(p, heard[2][1][name]), "held-out episodes are played by the selected controller"
+    assert any(not torch.equal(p, selected.get_parameter(n)) for n, p in heard[1][1].items())
+    kept = json.loads((tmp_path / "c" / "held_out.json").read_text())
+    assert (kept["success_rate"], kept["step"]) == (0.4, 192)
 
 
 def test_end_to_end(few_episodes, tmp_path):
@@ -361,8 +395,49 @@ def test_a_network_is_continued(few_episodes, tmp_path):
     assert trained.config.squash == "clip"  # it keeps its own bounds
     for name, p in trained.named_parameters():
         torch.testing.assert_close(p, before[name], rtol=1e-4, atol=1e-6)
+    assert json.loads((tmp_path / "c" / "recipe.json").read_text())["data"]["init"] == "given"
     with pytest.raises(CheckpointError, match="do not fit"):
         controllers.train_controller(recipe.replace(features="zh"), tmp_path / "d", model=model, init=init)
+
+
+def test_a_resume_need_not_name_what_it_went_on_from(few_episodes, tmp_path):
+    model = world_model()
+    init = Policy(Controller(ControllerConfig(21, n_hidden=24)), "z", "1d", None, model, name="given")
+    recipe = default_controller_recipe("z", "1d").replace(**SMALL)
+    controllers.train_controller(recipe, tmp_path / "c", model=model, init=init, stop_after=64)
+    done = controllers.train_controller(recipe, tmp_path / "c", model=model, resume=True)
+    assert done.steps == 128
+    assert checkpoint.load(tmp_path / "c").config.n_hidden == 24
+
+
+def test_a_refused_training_leaves_the_folder_free(few_episodes, tmp_path):
+    model = world_model()
+    recipe = default_controller_recipe("z", "1d").replace(**{**SMALL, "steps": 32, "rollout": 4})
+    with pytest.raises(ConfigError, match="physics"):
+        controllers.train_controller(recipe.replace(physics="foo"), tmp_path / "c", model=model)
+    assert controllers.train_controller(recipe, tmp_path / "c", model=model).steps == 32
+
+
+def test_a_resume_repairs_what_a_stopped_run_left_half_done(few_episodes, tmp_path):
+    model, out = world_model(), tmp_path / "c"
+    recipe = default_controller_recipe("z", "1d").replace(**{**SMALL, "steps": 32, "rollout": 4})
+    controllers.train_controller(recipe, out, model=model)
+    whole = {path: path.read_bytes() for path in out.glob("**/*.safetensors") if "checkpoints" not in path.parts}
+    assert len(whole) == 2
+    (out / "model.safetensors").unlink()  # as killed before it was published
+    (out / "world_model" / "config.json").unlink()
+    (out / "world_model" / "model.safetensors").write_bytes(b"half")
+    controllers.train_controller(recipe, out, model=model, resume=True)
+    assert {path: path.read_bytes() for path in whole} == whole
+    assert load_any_model(out).features == "z"
+
+
+def test_refit_refuses_what_is_no_policy(tmp_path):
+    recipe = default_controller_recipe("z", "1d").replace(**SMALL, refit=True)
+    model = world_model()
+    with pytest.raises(CheckpointError, match=r"--init is a .*expected a policy") as error:
+        controllers.train_controller(recipe, tmp_path / "c", model=model, init=model)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.slow

@@ -213,7 +213,7 @@ def test_m_learns_the_way_back_from_its_dreams():
     batch = {
         "z": z[:, :-1], "next_z": z[:, 1:], "goal": goal[:, :-1], "next_goal": goal[:, 1:],
         "action": torch.zeros(64, 4, 3), "restart": torch.zeros(64, 4), "next_last": torch.zeros(64, 4),
-        "mask": torch.ones(64, 4, dtype=torch.bool), "next_mask": torch.ones(64, 4, dtype=torch.bool),
+        **dict.fromkeys(("mask", "next_mask", "goal_mask"), torch.ones(64, 4, dtype=torch.bool)),
     }  # fmt: skip
     recipe = default_recipe("m", "1d").replace(dream_share=1.0)
     real = memory_loss(memory, batch, recipe, noise=None)[0].parts
@@ -273,10 +273,28 @@ def test_gradients_reach_every_weight_of_v_and_m():
         for name, n in (("z", 4), ("next_z", 4), ("goal", 2), ("next_goal", 2), ("action", 3))
     }
     flags = {"restart": torch.zeros(2, 5), "next_last": torch.zeros(2, 5)}
-    masks = dict.fromkeys(("mask", "next_mask"), torch.ones(2, 5, dtype=torch.bool))
+    masks = dict.fromkeys(("mask", "next_mask", "goal_mask"), torch.ones(2, 5, dtype=torch.bool))
     terms, _ = memory_loss(m, {**rows, **flags, **masks}, default_recipe("m", "1d"))
     terms.total.backward()
     assert unreached(m) == []
+
+
+def test_unknown_goals_teach_m_nothing():
+    torch.manual_seed(0)
+    m = checkpoint.make("memory", {"z_size": 4, "h_size": 8}).eval()
+    n = {"z": 4, "next_z": 4, "goal": 2, "next_goal": 2, "action": 3}
+    rows = {name: torch.randn(2, 5, size) for name, size in n.items()}
+    rows |= {"restart": torch.zeros(2, 5), "next_last": torch.zeros(2, 5)}
+    rows |= dict.fromkeys(("mask", "next_mask", "goal_mask"), torch.ones(2, 5, dtype=torch.bool))
+    recipe = default_recipe("m", "1d")
+    whole = memory_loss(m, rows, recipe)[0].parts
+    last = torch.tensor([1, 1, 1, 1, 0], dtype=torch.bool).expand(2, 5)
+    some = memory_loss(m, {**rows, "goal_mask": last}, recipe)[0].parts
+    assert some["z_error"] == whole["z_error"]
+    assert some["nll"] != whole["nll"]
+    far = {**rows, "goal_mask": last, "next_goal": rows["next_goal"].clone()}
+    far["next_goal"][:, 4] = 1e6
+    assert memory_loss(m, far, recipe)[0].parts == some
 
 
 def test_only_matrices_decay_by_default_and_nearly_all_by_the_authors():

@@ -10,8 +10,8 @@ from test_controllers import world_model
 from navrep_data.train import learner
 from navrep_data.train.controller_recipe import default_controller_recipe, environment
 from navrep_data.train.ppo import GroupedPPO, log_density
-from navrep_data.train.ppo_policy import BoundedPolicy
 from navrep_data.train.worlds import TrainingWorlds, WorldGroups
+from navrep_data.zoo.sb3 import BoundedPolicy
 
 WORLDS, ROLLOUT = 12, 30
 RECIPE = default_controller_recipe("z", "1d").replace(

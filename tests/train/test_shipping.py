@@ -10,7 +10,14 @@ import torch
 
 from navrep_data import zoo
 from navrep_data.cli.main import run
-from navrep_data.errors import CheckpointError, ConfigError, CorruptDataError, DatasetMismatchError, UnknownNameError
+from navrep_data.errors import (
+    CheckpointError,
+    ConfigError,
+    CorruptDataError,
+    DatasetMismatchError,
+    NavrepDataError,
+    UnknownNameError,
+)
 from navrep_data.evaluate.sources import weights_of
 from navrep_data.evaluate.world_model import world_model_error
 from navrep_data.evaluate.world_model_results import save
@@ -285,12 +292,17 @@ def test_what_does_not_belong_together_is_not_shipped(trained, package, dataset,
         patch.setattr(shipping, "SHIPPED_BYTES", 100_000)
         with pytest.raises(ConfigError, match=r"expected 100,000 at most"):
             shipping.ship(trained / "w", VARIANT, dataset, commands=["w"], **options)
+    assert not any(path.is_file() for path in (package / "weights").rglob("*")), "refused weights leave nothing"
     w = shipping.ship(trained / "w", VARIANT, dataset, commands=["w"], **options)
     torch.manual_seed(9)
     other = checkpoint.make("transformer", checkpoint.load(trained / "w").config)
     checkpoint.save(other, package / "weights" / w.name, storage="float16")
     with pytest.raises(CheckpointError, match="another world model than"):
         shipping.ship(trained / "c", f"{VARIANT}_z", dataset, commands=["c"], **options)
+    shipped = {path: path.read_bytes() for path in package.rglob("*") if path.is_file()}
+    with pytest.raises(NavrepDataError):  # its cost cannot be measured
+        shipping.ship(trained / "w", VARIANT, tmp_path / "nothing", commands=["again"], **options)
+    assert {path: path.read_bytes() for path in package.rglob("*") if path.is_file()} == shipped
     # a controller on z alone goes with any memory behind the same V
     other = checkpoint.load(trained / "w")
     with torch.no_grad():

@@ -19,7 +19,7 @@ from navrep_data.errors import (
     TrainingError,
 )
 from navrep_data.models import VAE, VAEConfig, checkpoint
-from navrep_data.train import default_recipe, original_recipe, shipped_recipes, train_world_model
+from navrep_data.train import default_recipe, original_recipe, read_recipe, shipped_recipes, train_world_model
 from navrep_data.train.encode import encode_dataset
 from navrep_data.train.logs import read_log
 from navrep_data.train.modular import join
@@ -229,6 +229,10 @@ def test_a_frozen_v_stays_and_the_memory_learns(model, dataset, tmp_path):
     with pytest.raises(ConfigError, match="freeze_v keeps V as --init gives it, but there is none") as error:
         train(frozen, dataset, tmp_path / "none")
     one_line(error)
+    again = train(frozen, dataset, tmp_path / "none", init=first, stop_after=1)  # the refusal left the folder free
+    (again.out / "model.safetensors").unlink()  # as killed before it was published
+    train(frozen, dataset, again.out, resume=True, stop_after=1)
+    assert checkpoint.load(again.out).config == done.config
     with pytest.raises(ConfigError, match="freeze_v is for joint and transformer"):
         recipe("v", "1d", freeze_v=True)
 
@@ -261,13 +265,31 @@ def test_world_models_start_from_a_v(model, dataset, tmp_path):
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("lr", 2.0), ("batch", 0), ("schedule", "linear"), ("steps", 1.5), ("residual", 1), ("lidar", "2d")],
+    [
+        ("lr", 2.0),
+        ("batch", 0),
+        ("schedule", "linear"),
+        ("steps", 1.5),
+        ("residual", 1),
+        ("lidar", "2d"),
+        ("kl_warmup", -5),
+        ("epsilon", -1.0),
+    ],
 )
 def test_recipes_are_checked(field, value):
     with pytest.raises(ConfigError, match=field):
         Recipe.from_dict({"model": "v", "lidar": "1d", field: value})
     with pytest.raises(ConfigError, match="Did you mean 'batch'"):
         Recipe.from_dict({"model": "v", "lidar": "1d", "batsh": 3})
+
+
+def test_a_recipe_file_of_two_models_gives_the_one_that_is_asked_for(tmp_path):
+    path = tmp_path / "modular_1d.json"
+    path.write_text(json.dumps({"settings": shipped_recipes()["modular_1d"]["settings"]}))
+    assert [read_recipe(path, model).model for model in ("v", "m")] == ["v", "m"]
+    for model in ("joint", None):
+        with pytest.raises(ConfigError, match="is a recipe for V and M, expected one for"):
+            read_recipe(path, model)
 
 
 def test_shipped_recipes_are_recipes():

@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from stable_baselines3 import PPO
 
 from navrep_data.models import Controller, ControllerConfig, EndToEnd, EndToEndConfig
 from navrep_data.models.vae import VAE, VAEConfig
@@ -56,6 +57,38 @@ def test_the_same_actions_and_values(index):
         std = model.policy.get_distribution(torch.tensor(features)).distribution.stddev[0]
     np.testing.assert_allclose(theirs, value, atol=1e-5)
     np.testing.assert_allclose(std, policy.network.logstd.exp().detach())
+
+
+@pytest.mark.parametrize("end_to_end", [False, True])
+def test_our_own_bounds_hold(end_to_end, tmp_path):
+    """Ours have a tanh and a speed limit, which a plain actor-critic has not."""
+    torch.manual_seed(0)
+    own = {"n_hidden": 32, "squash": "tanh", "max_speed": 1.0}
+    network = EndToEnd(EndToEndConfig("1d", **own)) if end_to_end else Controller(ControllerConfig(37, **own))
+    with torch.no_grad():
+        network.mean.weight *= 5.0  # so that both bounds are met
+        network.logstd.copy_(torch.tensor([-9.0, 9.0]))
+    vae = None if end_to_end else VAE(VAEConfig("1d", 32))
+    policy = Policy(network.eval(), None if vae is None else "z", "1d", vae, name="ours")
+    rng = np.random.default_rng(0)
+    scan, state = (
+        rng.uniform(0.5, 25, (64, 1080)).astype(np.float32),
+        rng.normal(size=(64, 5), scale=5.0).astype(np.float32),
+    )
+    features, expected = policy.encode(scan, state), policy.act(scan, state)[:, :2]
+    speed = np.linalg.norm(expected, axis=1)
+    assert (speed > 0.999).any()
+    assert (speed < 0.99).any()
+    model = to_sb3(policy)
+    np.testing.assert_allclose(model.predict(features, deterministic=True)[0], expected, atol=1e-5)
+    drawn, _ = model.predict(features)
+    assert np.abs(drawn - expected).max() > 0.1
+    assert np.linalg.norm(drawn, axis=1).max() <= 1 + 1e-6
+    width = model.policy.get_distribution(torch.tensor(features)).distribution.stddev[0]
+    np.testing.assert_allclose(width.detach(), [0.05, 0.6], rtol=1e-5)
+    model.save(tmp_path / "m")
+    again = PPO.load(tmp_path / "m", device="cpu")
+    np.testing.assert_allclose(again.predict(features, deterministic=True)[0], expected, atol=1e-5)
 
 
 def test_it_trains_and_the_weights_come_back():
