@@ -240,6 +240,7 @@ class _Run(BaseCallback):
         try:
             if self.at.step < stop:
                 self._learn(stop - self.at.step)
+                self._log(self.ppo.num_timesteps)
                 self._checkpoint(validate=True)
         finally:
             self.bar.close()

@@ -17,8 +17,8 @@ UNTAGGED_ARE_OURS = frozenset(
     for kind in ("modular", "joint", "transformer")
     for lidar in ("rings", "1d")
     for features in ("", "_z")
-)
-"""Variants whose untagged name is ``.v1``, shipped or about to be; that of all others is ``.released``."""
+) | {"e2e_1d"}
+"""Variants whose untagged name is ``.v1``, which the package holds; that of all others is ``.released``."""
 
 RELEASED_RULE = (
     "Of the runs of a variant, the one that was started last, runs that their own file name calls partial excepted. "
@@ -41,8 +41,8 @@ def split_name(name: str) -> tuple[str, str | None]:
     --------
     >>> split_name("e2e_1d.20201026")
     ('e2e_1d', '20201026')
-    >>> split_name("e2e_1d")
-    ('e2e_1d', None)
+    >>> split_name("e2e_rings")
+    ('e2e_rings', None)
     """
     variant, dot, tag = name.partition(".")
     return variant, tag if dot else None
