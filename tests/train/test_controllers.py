@@ -376,6 +376,20 @@ def test_the_authors_settings_run_and_report_the_episodes_they_did_not_select_on
     assert (kept["success_rate"], kept["step"]) == (0.4, 192)
 
 
+@pytest.mark.parametrize(("make", "scale"), [(default_controller_recipe, 1 / 32), (original_controller_recipe, 1.0)])
+def test_only_our_own_end_to_end_training_scales_ranges(make, scale):
+    recipe = make("e2e", "1d").replace(worlds=2, rollout=4, batch=8)
+    network = learner.make_network(recipe, None)
+    worlds = learner.make_worlds(recipe, network, None, None, 0)
+    assert learner.make_ppo(recipe, worlds, network, "cpu").policy.features_extractor.scale == scale
+
+
+@pytest.mark.parametrize(("name", "value"), [("gamma", 3.0), ("gae_lambda", 50.0), ("clip_range", 9.0), ("lr", 2.0)])
+def test_settings_have_limits(name, value):
+    with pytest.raises(ConfigError, match=rf"{name} is .*expected a number from 0 to 1\."):
+        default_controller_recipe("z", "1d").replace(**{name: value})
+
+
 def test_end_to_end(few_episodes, tmp_path):
     recipe = default_controller_recipe("e2e", "1d").replace(**{**SMALL, "steps": 64})
     controllers.train_controller(recipe, tmp_path / "c")
