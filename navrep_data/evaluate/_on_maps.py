@@ -6,15 +6,7 @@ from navrep_data.evaluate._polygons import human_gap
 from navrep_data.sim._ian_contact import CLEARANCE_REACH, swept_cells
 from navrep_data.sim._ian_layout import M_MAP
 from navrep_data.sim._ian_orca import guided_velocity, pack_agents
-from navrep_data.sim._ian_scan import state_on_map
 from navrep_data.sim._layout import A_RADIUS, A_X, A_Y, S_HUMANS
-
-
-@kernel
-def states_on_maps(agents, walkers, out):
-    """Fill out (W, 5) with the robots' states."""
-    for w in range(agents.shape[0]):
-        state_on_map(0, agents[w], walkers[w], out[w])
 
 
 @kernel

@@ -7,8 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from navrep_data.evaluate._on_maps import guided_robots, start_gaps, states_on_maps
-from navrep_data.schema import ROBOT_STATE_SIZE
+from navrep_data.evaluate._on_maps import guided_robots, start_gaps
 from navrep_data.sim import SimConfig, Simulator, scale_actions
 from navrep_data.sim import _layout as lay
 from navrep_data.sim._fast_marching import UPWIND_FINAL, march
@@ -74,9 +73,7 @@ class ScenarioWorlds:
 
     def robot_states(self) -> F32:
         """Return robot states (W, 5)."""
-        states = np.zeros((self.n, ROBOT_STATE_SIZE), np.float32)
-        states_on_maps(self._state.agents, self._state.walkers, states)
-        return states
+        return self.simulator.robot_states()
 
     def poses(self) -> F64:
         """Return x, y, theta of the robots (W, 3)."""

@@ -101,14 +101,8 @@ class PolygonWorlds:
         return self.simulator.observe()[0]
 
     def robot_states(self) -> F32:
-        """See :class:`Worlds`; as :meth:`Simulator.observe`, without its scans."""
-        a = self.simulator.arrays
-        robot = a.agents[:, 0]
-        c, s = np.cos(robot[:, lay.A_HEADING]), np.sin(robot[:, lay.A_HEADING])
-        gx, gy = (robot[:, lay.A_GX] - robot[:, lay.A_X]), (robot[:, lay.A_GY] - robot[:, lay.A_Y])
-        vx, vy = robot[:, lay.A_VX], robot[:, lay.A_VY]
-        columns = [c * gx + s * gy, c * gy - s * gx, c * vx + s * vy, c * vy - s * vx, robot[:, lay.A_OMEGA]]
-        return np.stack(columns, axis=1).astype(np.float32)
+        """See :class:`Worlds`."""
+        return self.simulator.robot_states()
 
     def _robots(self, columns: int | list[int]) -> F64:
         found: F64 = self.simulator.arrays.agents[:, 0, columns]

@@ -88,6 +88,16 @@ def observe_worlds(
 
 
 @kernel
+def observe_states(mask, agents, flags, states):
+    """Fill robot states (W R, 5), robot by robot, of the worlds of `mask` (W,)."""
+    robots = flags[F_ROBOTS]
+    for w in range(agents.shape[0]):
+        if mask[w]:
+            for r in range(robots):
+                observe_state(r, agents[w], flags, states[w * robots + r])
+
+
+@kernel
 def observe_others(agents, scalars, hits, flags, out):
     """Fill out (W R, slots, 6) with what each robot's humans column holds."""
     robots = flags[F_ROBOTS]

@@ -65,6 +65,16 @@ def observe_map_worlds(
 
 
 @kernel
+def observe_map_states(mask, worlds, rules, states):
+    """Fill robot states (W R, 5), robot by robot, of the worlds of `mask` (W,)."""
+    robots = int(rules[R_ROBOTS])
+    for w in range(worlds.agents.shape[0]):
+        if mask[w]:
+            for r in range(robots):
+                state_on_map(r, worlds.agents[w], worlds.walkers[w], states[w * robots + r])
+
+
+@kernel
 def ways_ahead(worlds, maps, path, out):
     """Fill out (W, 2) with the point about a metre ahead of each world's first robot on its way to the goal [m]."""
     for w in range(out.shape[0]):

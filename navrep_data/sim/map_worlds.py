@@ -176,6 +176,10 @@ class MapWorlds:
         )  # fmt: skip
         return states
 
+    def robot_states(self, mask: NDArray[np.bool_], states: F32) -> None:
+        """Fill robot states (W R, 5) in the worlds of `mask` (W,)."""
+        _ian_batch.observe_map_states(mask, self.arrays.worlds, self.arrays.rules, states)
+
     def ways_ahead(self) -> F64:
         """Return a point about a metre ahead of each first robot on its way to the goal, (W, 2) [m]."""
         out = np.zeros((self.n_worlds, 2))

@@ -348,6 +348,18 @@ class Simulator:
             )  # fmt: skip
         return a.scans.copy().reshape(*per_robot, -1), states.reshape(*per_robot, ROBOT_STATE_SIZE)
 
+    def robot_states(self, mask: ArrayLike | None = None) -> F32:
+        """Return the robot states (W, 5) of :meth:`observe`, without its scans; with R > 1 robots (W, R, 5).
+
+        With a `mask` (W,) the states of other worlds are 0.
+        """
+        states = np.zeros((self.n_worlds * self.config.robots, ROBOT_STATE_SIZE), np.float32)
+        if self.maps is not None:
+            self.maps.robot_states(self._mask(mask), states)
+        else:
+            _batch.observe_states(self._mask(mask), self.arrays.agents, self.arrays.flags, states)
+        return states.reshape(self.n_worlds, *self._per_robot, ROBOT_STATE_SIZE)
+
     def humans(self) -> F32:
         """Return what the `humans` column would hold now: (W, max_others, 6) float32, NaN-padded.
 

@@ -72,6 +72,15 @@ def test_humans_start_free_and_stay_out_of_walls(path: str, policy: str) -> None
     assert (moved > 1.0).any() != (policy == "static")
 
 
+@pytest.mark.parametrize("robots", [1, 2])
+def test_robot_states_are_those_of_observe(path: str, robots: int) -> None:
+    simulator = Simulator(make_config("map", maps=(path,), humans=0, robots=robots), 2, seed=2)
+    simulator.step(np.broadcast_to([0.3, -0.2, 0.5], (2, 3) if robots == 1 else (2, robots, 3)))
+    states = simulator.robot_states()
+    np.testing.assert_array_equal(states, simulator.observe()[1])
+    assert states[..., 4] == pytest.approx(0.5)
+
+
 def test_orca_robot_finds_the_door(path: str) -> None:
     """The planner-guided ORCA robot gets from room to room; ORCA alone would push against the wall."""
     config = make_config("map", maps=(path,), humans=0)

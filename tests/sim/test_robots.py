@@ -36,6 +36,19 @@ def test_shapes():
         sim.step(np.zeros((2, 3)))
 
 
+@pytest.mark.parametrize("settings", [{"physics": "original"}, {"robots": 3}, {"inertia": "limited"}])
+def test_robot_states_are_those_of_observe(settings):
+    env = "navrep-test" if "physics" in settings else "soadrl"
+    sim = Simulator(make_config(env, humans=1, obstacles=1, **settings), n_worlds=3, seed=0)
+    for _ in range(2):
+        sim.step(np.broadcast_to([0.3, -0.2, 0.5], (3, *sim.robot_states().shape[1:-1], 3)))
+    states = sim.robot_states()
+    np.testing.assert_array_equal(states, sim.observe()[1])
+    masked = sim.robot_states([True, False, True])
+    np.testing.assert_array_equal(masked[[0, 2]], states[[0, 2]])
+    assert not masked[1].any()
+
+
 def test_places():
     sim = Simulator(make_config("soadrl", robots=10, humans=10), n_worlds=30, seed=0)
     for w in range(30):
