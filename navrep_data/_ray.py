@@ -176,7 +176,7 @@ class RayCluster(Generic[Task, Result]):
         try:
             good, value, node = self._ray.get(ref)
         except lost as error:
-            raise _LostError(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
+            raise _LostError(f"{type(error).__name__}: {error}") from error
         except errors.RayTaskError as error:
             if isinstance(error.cause, ImportError):
                 raise ClusterError(
@@ -205,7 +205,7 @@ def _call(function: Callable[[Any, Any], Any], common: Any, task: Any, version: 
 
 def _no_cluster(where: str, error: Exception) -> ClusterError:
     return ClusterError(
-        f"No Ray cluster can be used at {where} ({' '.join(str(error).split())[:200]}); expected the host:port that "
+        f"No Ray cluster can be used at {where} ({error}); expected the host:port that "
         "`ray start --head` prints, or no --address for a cluster on this machine."
     )
 

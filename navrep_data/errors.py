@@ -1,17 +1,59 @@
 """Every exception of the package.
 
 Each class inherits from :class:`NavrepDataError`, so that one ``except`` catches them all, and from the builtin
-that a caller would expect there. Messages are one line: what was seen, what was expected, what to do.
+that a caller would expect there. Messages are one line: what was seen, what was expected, what to do. They quote names
+and texts from outside as they are; :func:`one_line` makes what is shown of them harmless, here and nowhere else.
 """
 
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
+
+LONGEST_MESSAGE = 1200
+"""Characters of the longest message; the longest of our own, which list the settings of a recipe, have about 900."""
+_END = 500  # what to do stands at the end, and is kept
+_GAP = " [...] "
+_SPACE = re.compile(r"\s+")
+_BREAKS = frozenset("\t\n\v\f\r\x1c\x1d\x1e\x1f\x85\u2028\u2029")
+_UNSEEN = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # control characters, and bytes of a name that are no text
+
+
+def one_line(text: object) -> str:
+    """Return what can be shown of a text from outside: one line, of no more than :data:`LONGEST_MESSAGE` characters.
+
+    Line breaks become spaces, characters that steer a terminal or cannot be written are escaped. What is too long is
+    cut in the middle: what was seen comes first in a message, what to do last. Any other text stays as it is.
+
+    Parameters
+    ----------
+    text : object
+        A message, or an error of another library.
+    """
+    shown = _cut(str(text), 10 * LONGEST_MESSAGE).strip()  # a whole file may have been quoted
+    shown = _SPACE.sub(lambda found: found[0] if _BREAKS.isdisjoint(found[0]) else " ", shown)
+    shown = _UNSEEN.sub(lambda found: ascii(found[0])[1:-1], shown)
+    return _cut(shown, LONGEST_MESSAGE)
+
+
+def _cut(text: str, longest: int) -> str:
+    if len(text) <= longest:
+        return text
+    return text[: longest - len(_GAP) - _END] + _GAP + text[-_END:]
 
 
 class NavrepDataError(Exception):
-    """Base class of all errors that this package raises on purpose."""
+    """Base class of all errors that this package raises on purpose.
+
+    Parameters
+    ----------
+    message : str
+        What was seen, what was expected, what to do. Shown as :func:`one_line` makes it.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(one_line(message))
 
 
 class ConfigError(NavrepDataError, ValueError):

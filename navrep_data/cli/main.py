@@ -28,7 +28,7 @@ from navrep_data.cli import (
     view,
 )
 from navrep_data.cli._common import INTERRUPTED, INTERRUPTED_LINE
-from navrep_data.errors import NavrepDataError, did_you_mean
+from navrep_data.errors import NavrepDataError, did_you_mean, one_line
 
 app = typer.Typer(
     name="navrep-data",
@@ -113,10 +113,10 @@ def run(arguments: list[str] | None = None) -> None:
 def _explain(error: Exception) -> str | None:
     """Return one line for an error that has an explanation, None for one that is a bug of ours."""
     if isinstance(error, NavrepDataError):
-        return "Error: " + " ".join(str(error).split())
+        return f"Error: {error}"
     if not isinstance(error, _ClickException):
         return None
-    text: str = error.format_message().rstrip(".")
+    text = one_line(error.format_message()).rstrip(".")
     context = getattr(error, "ctx", None)
     if type(error).__name__ == "NoArgsIsHelpError":
         return text

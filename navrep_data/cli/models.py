@@ -120,7 +120,7 @@ def fetch_command(name: Name = None, every: All = False, source: From = None, as
             except NavrepDataError as error:
                 if len(chosen) == 1:
                     raise
-                problems.append(" ".join(str(error).split()))
+                problems.append(str(error))
     if as_json:
         print_json({"files": files, "problems": problems})
     else:

@@ -146,14 +146,12 @@ def parse_settings(known: dict[str, Any], settings: list[str] | None) -> dict[st
     for pair in settings or ():
         name, equals, text = pair.partition("=")
         if not equals or name not in known:
-            raise ConfigError(
-                f"--set {pair[:60]!r} is no setting.{did_you_mean(name, known)} Known: {', '.join(known)}."
-            )
+            raise ConfigError(f"--set {pair!r} is no setting.{did_you_mean(name, known)} Known: {', '.join(known)}.")
         kind = type(known[name])
         try:
             found[name] = {"true": True, "false": False}[text.lower()] if kind is bool else kind(text)
         except (KeyError, ValueError):
-            raise ConfigError(f"--set {name}={text[:40]} is no {kind.__name__}, as {name} is.") from None
+            raise ConfigError(f"--set {name}={text} is no {kind.__name__}, as {name} is.") from None
     return found
 
 
@@ -174,7 +172,7 @@ def check_device(device: str) -> None:
     try:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0][:80]
+        reason = str(error).splitlines()[0]
         raise ConfigError(
             f"--device {device!r} cannot be used ({reason}), expected cpu, or cuda where there is one."
         ) from None

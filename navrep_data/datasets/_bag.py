@@ -160,7 +160,7 @@ class Bag:
         except NavrepDataError:
             raise
         except Exception as error:  # damaged bags make the library raise nearly anything
-            reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+            reason = str(error).strip().rstrip(".") or type(error).__name__
             raise CorruptDataError(f"{self.path} cannot be read as a ROS bag ({reason}); get it again.") from error
 
     # -- topics

@@ -91,12 +91,12 @@ def parse_repo(text: str, revision: str | None = None) -> tuple[str, str]:
     """
     repo, at, found = text.removeprefix(HUB_SCHEME).partition("@")
     if not REPO_NAME.fullmatch(repo) or ".." in repo or "--" in repo:
-        raise ConfigError(f"The repository is {text[:120]!r}, expected user/name as on the Hub.")
+        raise ConfigError(f"The repository is {text!r}, expected user/name as on the Hub.")
     if at and revision is not None and found != revision:
         raise ConfigError(f"{text!r} names a revision, and another one is given ({revision!r}): leave one out.")
     chosen = found if at else "main" if revision is None else revision
     if not _REVISION.fullmatch(chosen) or ".." in chosen:
-        raise ConfigError(f"The revision is {chosen[:80]!r}, expected a branch, tag or commit.")
+        raise ConfigError(f"The revision is {chosen!r}, expected a branch, tag or commit.")
     return repo, chosen
 
 
@@ -192,7 +192,7 @@ def _passing(error: Exception) -> tuple[str | None, float | None]:
         if isinstance(e, httpx2.TimeoutException):
             return "the Hub is silent", None
         if isinstance(e, httpx2.TransportError):
-            return " ".join(str(e).split())[:200] or type(e).__name__, None
+            return str(e) or type(e).__name__, None
         if type(e) is OSError and e.errno is None and "Consistency check failed" in str(e):
             return "a file arrived with another size than announced", None
     return None, None
@@ -229,8 +229,8 @@ def explain(what: str, error: Exception) -> NavrepDataError:
             if isinstance(translated, NavrepDataError):
                 return translated
         first = found[-1]  # what began it says more than what was made of it
-        return HubError(f"Cannot {what}: {' '.join(str(first).split())[:300].rstrip('.') or type(first).__name__}.")
-    said = " ".join(response.headers.get("x-error-message", "").split())[:200]
+        return HubError(f"Cannot {what}: {str(first).strip().rstrip('.') or type(first).__name__}.")
+    said = response.headers.get("x-error-message", "")
     advice = {
         401: "it is private or not there, or the token is not accepted; log in with `hf auth login`, or set HF_TOKEN",
         403: "the token may not do that; make one that may write, and log in with `hf auth login`",
@@ -275,7 +275,7 @@ def resolve(text: str, kind: Kind, revision: str | None = None, token: str | boo
             what = f"find {kind} {repo} at revision {asked} on {constants.ENDPOINT}"
             commit = str(call(what, lambda: api.repo_info(repo, repo_type=kind, revision=asked)).sha)
     if not COMMIT.fullmatch(commit):
-        raise HubError(f"The Hub gave commit {commit[:60]!r} for {repo}, expected 40 hex digits: ask another endpoint.")
+        raise HubError(f"The Hub gave commit {commit!r} for {repo}, expected 40 hex digits: ask another endpoint.")
     if commit != asked and not is_offline():
         _remember(repo, kind, asked, commit)
     return Revision(repo, kind, commit, asked, constants.ENDPOINT, token)

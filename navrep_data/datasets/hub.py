@@ -237,7 +237,7 @@ def check_names(manifest: Manifest, at: object) -> None:
     named += [("extra", e.file) for e in manifest.extras]
     for kind, name in named:
         if not _FILES[kind].fullmatch(name):
-            raise CorruptDataError(f"{at} names a {kind} {name[:120]!r}, expected a plain name in its folder.")
+            raise CorruptDataError(f"{at} names a {kind} {name!r}, expected a plain name in its folder.")
 
 
 def fetch_manifest(at: client.Revision, folder: Path | None) -> tuple[Manifest, dict[str, client.RemoteFile]]:
@@ -465,6 +465,6 @@ def parse_shards(text: str) -> list[int]:
         found = re.fullmatch(r"\s*(\d{1,6})(?:-(\d{1,6}))?\s*", piece)
         first, last = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
         if first > last:
-            raise ConfigError(f"--shards is {text[:60]!r}, expected numbers and ranges as in 0-9,12.")
+            raise ConfigError(f"--shards is {text!r}, expected numbers and ranges as in 0-9,12.")
         numbers |= set(range(first, last + 1))
     return sorted(numbers)

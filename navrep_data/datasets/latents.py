@@ -23,7 +23,7 @@ from torch.utils.data import Dataset
 from navrep_data.datasets._batch import Assembler, BatchSpec
 from navrep_data.datasets._index import Ints, WindowTable, across_episodes, within_episodes
 from navrep_data.datasets._windows import Batch, check_choice, check_rows
-from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, SchemaVersionError
+from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, SchemaVersionError, one_line
 from navrep_data.io import atomic_write_bytes, json_bytes, read_json, safe_join, sha256_bytes
 from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, SensorContract
 from navrep_data.shards import SPLITS, Episodes, shard_file
@@ -132,12 +132,12 @@ class LatentManifest:
         if not isinstance(found, dict) or found.get("format") != FORMAT_NAME:
             kind = found.get("format") if isinstance(found, dict) else type(found).__name__
             raise CorruptDataError(
-                f"{path} has format {str(kind)[:40]!r}, expected {FORMAT_NAME!r}: M trains on codes, make them first: "
+                f"{path} has format {str(kind)!r}, expected {FORMAT_NAME!r}: M trains on codes, make them first: "
                 f"navrep-data encode {root} --model V --out LATENTS"
             )
         if found.get("format_version") != FORMAT_VERSION:
             raise SchemaVersionError(
-                f"{path} has format version {repr(found.get('format_version'))[:20]}, this package reads "
+                f"{path} has format version {found.get('format_version')!r}, this package reads "
                 f"{FORMAT_VERSION}. Upgrade it: pip install -U navrep-data"
             )
         hashed = {name: value for name, value in found.items() if name != "manifest_sha256"}
@@ -148,14 +148,13 @@ class LatentManifest:
         except (KeyError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
             if isinstance(error, CorruptDataError):
                 raise
-            said = " ".join(repr(error).split())[:160]
-            raise CorruptDataError(f"{path} lacks or garbles a field ({said}); encode again.") from error
+            raise CorruptDataError(f"{path} lacks or garbles a field ({error!r}); encode again.") from error
 
     @classmethod
     def _parse(cls, found: dict[str, Any], root: Path) -> LatentManifest:
         z_size = found["z_size"]
         if type(z_size) is not int or not 1 <= z_size <= _MAX_Z:
-            raise ValueError(f"z_size {repr(z_size)[:20]}")
+            raise ValueError(f"z_size {z_size!r}")
         shards = []
         for entry in found["shards"]:
             first, stop = (int(n) for n in entry["sequences"])
@@ -164,7 +163,7 @@ class LatentManifest:
             )
             safe_join(root, shard.file)
             if not 0 < shard.bytes <= _MAX_SHARD_BYTES or shard.rows < 1 or not 0 <= first < stop:
-                raise ValueError(f"shard {shard.file[:60]}")
+                raise ValueError(f"shard {shard.file}")
             shards.append(shard)
         SensorContract(**found["sensor"])
         splits = {str(name): [[int(a), int(b)] for a, b in ranges] for name, ranges in found["splits"].items()}
@@ -212,8 +211,7 @@ def read_latent_shard(root: Path, shard: LatentShard, z_size: int) -> dict[str, 
             for name, (dtype, width) in _COLUMNS.items():
                 columns[name] = _column(file, name, dtype, width if width >= 0 else z_size, shard.rows)
     except Exception as error:  # a damaged file makes the HDF5 library raise nearly anything
-        said = " ".join(str(error).split())[:80]
-        raise CorruptDataError(f"{path} is not a shard of codes ({said}); encode again.") from error
+        raise CorruptDataError(f"{path} is not a shard of codes ({error}); encode again.") from error
     return columns
 
 
@@ -338,7 +336,7 @@ class LatentDataset(Dataset[Batch]):
         index = np.asarray(indices, np.int64)
         n = len(self.table)
         if index.ndim != 1 or len(index) == 0 or index.min() < -n or index.max() >= n:
-            raise IndexError(f"indices {repr(index)[:60]} do not fit {n} windows.")
+            raise IndexError(f"indices {one_line(repr(index))} do not fit {n} windows.")
         chosen, table = np.mod(index, n), self.table
         return self._assemble(self._rows, table.start[chosen], table.count[chosen], table.after[chosen])
 

@@ -70,7 +70,7 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path, read: bool) -> tuple
     try:
         info = archive.getinfo(f"{name}.npy")
     except KeyError:
-        has = ", ".join(found[:40] for found in archive.namelist()[:8])
+        has = ", ".join(archive.namelist()[:8])
         raise CorruptDataError(
             f"{path} has no array {name!r} (it has: {has}); expected {', '.join(_EXPECTED)}."
         ) from None
@@ -117,9 +117,8 @@ def _load(path: Path, read: bool = True) -> tuple[int, Arrays]:
     except DatasetError:
         raise
     except Exception as error:  # damaged archives raise a dozen kinds, struct.error and zlib.error among them
-        said = " ".join(str(error).split())[:160]
         raise CorruptDataError(
-            f"{path} cannot be read as npz ({said}). Expected a file of the original software; get it again."
+            f"{path} cannot be read as npz ({error}). Expected a file of the original software; get it again."
         ) from error
     rows = {count for count, _ in found.values()}
     if len(rows) != 1:

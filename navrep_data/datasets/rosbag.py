@@ -338,5 +338,5 @@ def parse_mount(text: str) -> tuple[float, ...]:
     try:
         x, y, yaw = map(float, text.split(","))
     except ValueError:
-        raise ConfigError(f"--mount is {text[:60]!r}; expected x,y,yaw as in 0.25,0,0 [m, m, rad].") from None
+        raise ConfigError(f"--mount is {text!r}; expected x,y,yaw as in 0.25,0,0 [m, m, rad].") from None
     return x, y, yaw

@@ -17,6 +17,7 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 from navrep_data._version import __version__
+from navrep_data.errors import one_line
 from navrep_data.io import cache_dir
 
 DISTRIBUTION = "navrep-data"
@@ -75,6 +76,9 @@ class Check:
     status: Status
     what: str
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "what", one_line(self.what))
+
 
 def check_installation(*, progress: Callable[[str], None] | None = None) -> list[Check]:
     """Check this installation.
@@ -104,12 +108,8 @@ def check_installation(*, progress: Callable[[str], None] | None = None) -> list
         try:
             found += make()
         except Exception as error:  # what is broken here may raise anything, and that is what we came to tell
-            found.append(Check(name, "problem", f"could not be checked: {type(error).__name__}: {_line(error)}"))
+            found.append(Check(name, "problem", f"could not be checked: {type(error).__name__}: {error}"))
     return found
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200]
 
 
 def _python() -> Iterator[Check]:
@@ -135,7 +135,7 @@ def _packages() -> Iterator[Check]:
                 importlib.import_module(_module(requirement.name))
             except Exception as error:  # a broken binary raises anything
                 again = f"pip install --force-reinstall {requirement.name}"
-                check = Check(requirement.name, "problem", f"cannot be imported ({_line(error)}): {again}")
+                check = Check(requirement.name, "problem", f"cannot be imported ({error}): {again}")
         yield check
 
 

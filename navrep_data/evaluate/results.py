@@ -150,9 +150,8 @@ class Results:
             results = cls({key: value[key] for key in ("name", "sees", "variant", "settings", "versions")})
             results._read(value)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            said = " ".join(str(error).split())[:120]
             raise CorruptDataError(
-                f"{path} is not a results file of this version ({type(error).__name__}: {said}). Expected one written "
+                f"{path} is not a results file of this version ({type(error).__name__}: {error}). Expected one written "
                 "by navrep-data benchmark; run it again with another --out."
             ) from error
         return results
@@ -229,15 +228,10 @@ def open_results(path: Path, header: dict[str, Any]) -> Results:
     for key in (*new, *old):
         if old.get(key) != new.get(key):
             raise DatasetMismatchError(
-                f"{path} was made with {key} = {_short(old.get(key))}, expected {_short(new.get(key))}: choose another "
+                f"{path} was made with {key} = {old.get(key)!r}, expected {new.get(key)!r}: choose another "
                 "--out, or remove it to play again."
             )
     return found
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
 
 
 def file_name(spec: PilotSpec) -> str:

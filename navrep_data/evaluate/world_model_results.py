@@ -78,7 +78,7 @@ def load(path: Path | str) -> tuple[WorldModelError, dict[str, Any]]:
         result = WorldModelError(**value["result"])
         about = {key: value[key] for key in ("data", "files", "navrep_data")} | {"limit": value.get("limit")}
         if type(about["limit"]) not in (int, type(None)):
-            raise ValueError(f"limit {str(about['limit'])[:40]!r}")
+            raise ValueError(f"limit {str(about['limit'])!r}")
     except (KeyError, TypeError, ValueError) as error:
         raise CorruptDataError(
             f"{os.fspath(path)} is no world-model result of this version ({error}). Expected one written by "

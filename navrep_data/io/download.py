@@ -296,7 +296,7 @@ def _attempt(client: httpx2.Client, job: _Job) -> None:
     except httpx2.TimeoutException as error:
         raise _TryAgainError(f"silent for {job.timeout:g} s") from error
     except httpx2.TransportError as error:
-        raise _TryAgainError(" ".join(str(error).split()) or type(error).__name__) from error
+        raise _TryAgainError(str(error) or type(error).__name__) from error
     if total is not None and _size(job.part) < total:
         raise _TryAgainError(f"the connection ended after {_size(job.part):,} of {total:,} bytes")
 

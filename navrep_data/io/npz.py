@@ -50,7 +50,7 @@ def read_npz(source: BinaryIO | bytes, max_bytes: int) -> dict[str, NDArray[Any]
     except MemoryError:
         raise
     except Exception as error:  # damaged archives raise a dozen kinds, struct.error and zlib.error among them
-        raise ValueError(" ".join(str(error).split())[:160] or type(error).__name__) from error
+        raise ValueError(str(error) or type(error).__name__) from error
 
 
 def parse_npy(data: bytes) -> NDArray[Any]:
@@ -67,7 +67,7 @@ def parse_npy(data: bytes) -> NDArray[Any]:
         raise ValueError(f"npy version {version}, expected (1, 0)")
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
     if dtype.hasobject or any(type(n) is not int or n < 0 for n in shape):
-        raise ValueError(f"{str(dtype)[:40]} of shape {str(shape)[:60]}, expected plain numbers")
+        raise ValueError(f"{dtype} of shape {shape}, expected plain numbers")
     if dtype.itemsize * math.prod(shape) != len(data) - stream.tell():
-        raise ValueError(f"shape {str(shape)[:60]} does not fit its bytes")
+        raise ValueError(f"shape {shape} does not fit its bytes")
     return np.array(np.ndarray(shape, dtype, data, stream.tell(), order="F" if fortran else "C"))

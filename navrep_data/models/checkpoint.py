@@ -74,7 +74,7 @@ def make(kind: str, config: Mapping[str, Any] | ModelConfig) -> nn.Module:
     """
     if kind not in _KINDS:
         raise ConfigError(
-            f"Unknown kind of network {str(kind)[:60]!r}.{did_you_mean(str(kind), KINDS)} Known: {', '.join(KINDS)}."
+            f"Unknown kind of network {str(kind)!r}.{did_you_mean(str(kind), KINDS)} Known: {', '.join(KINDS)}."
         )
     config_type, network_type = _KINDS[kind]
     settings = config if isinstance(config, config_type) else config_type.from_dict(config)
@@ -185,7 +185,7 @@ def read_config(path: Path | str) -> dict[str, Any]:
         raise CheckpointError(f"{config_path} is not the config of a navrep-data model (no format {FORMAT_NAME!r}).")
     if found.get("format_version") != FORMAT_VERSION:
         raise CheckpointError(
-            f"{config_path} has format version {repr(found.get('format_version'))[:20]}, expected {FORMAT_VERSION}: "
+            f"{config_path} has format version {found.get('format_version')!r}, expected {FORMAT_VERSION}: "
             "install a newer navrep-data."
         )
     return found
@@ -211,7 +211,7 @@ def load(path: Path | str) -> nn.Module:
     kind, storage = found.get("kind"), found.get("weights_dtype", "float32")
     settings = found.get("config", {})
     if not isinstance(storage, str) or storage not in STORAGE:
-        raise CheckpointError(f"{config_path}: weights_dtype is {str(storage)[:40]!r}, expected {', '.join(STORAGE)}.")
+        raise CheckpointError(f"{config_path}: weights_dtype is {str(storage)!r}, expected {', '.join(STORAGE)}.")
     module = make(str(kind), settings)
     expected = module.state_dict()
     if not weights_path.is_file():
@@ -231,11 +231,10 @@ def load(path: Path | str) -> nn.Module:
     try:
         state = safetensors.torch.load(data)
     except safetensors.SafetensorError as error:
-        said = " ".join(str(error).split())[:160]  # it may repeat what it read
-        raise CheckpointError(f"{weights_path} is not a safetensors file ({said}); get it again.") from error
+        raise CheckpointError(f"{weights_path} is not a safetensors file ({error}); get it again.") from error
     for name, value in state.items():
         if value.dtype != STORAGE[storage]:
-            raise CheckpointError(f"{weights_path}: {name[:80]!r} is {value.dtype}, expected {storage}; get it again.")
+            raise CheckpointError(f"{weights_path}: {name!r} is {value.dtype}, expected {storage}; get it again.")
     put_weights(module, {name: value.to(torch.float32) for name, value in state.items()}, str(weights_path))
     return module
 
@@ -263,7 +262,7 @@ def put_weights(module: nn.Module, state: Mapping[str, Tensor], source: str) -> 
             raise CheckpointError(f"{source} lacks the weights {name!r} of a {type(module).__name__}.")
     for name, value in state.items():
         if name not in expected:
-            raise CheckpointError(f"{source} has weights {name[:80]!r}, unknown in a {type(module).__name__}.")
+            raise CheckpointError(f"{source} has weights {name!r}, unknown in a {type(module).__name__}.")
         wanted = tuple(expected[name].shape)
         if tuple(value.shape) != wanted or value.dtype != torch.float32:
             raise CheckpointError(

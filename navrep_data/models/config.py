@@ -35,16 +35,14 @@ class ModelConfig:
             limit = _LARGEST_OF.get(field.name, _LARGEST)
             if field.type == "int" and (type(value) is not int or not 1 <= value <= limit):
                 raise ConfigError(
-                    f"{field.name} of a {self.kind} is {repr(value)[:40]}, expected a whole number from 1 to {limit}."
+                    f"{field.name} of a {self.kind} is {value!r}, expected a whole number from 1 to {limit}."
                 )
             if field.type == "bool" and type(value) is not bool:
-                raise ConfigError(f"{field.name} of a {self.kind} is {str(value)[:40]!r}, expected true or false.")
+                raise ConfigError(f"{field.name} of a {self.kind} is {str(value)!r}, expected true or false.")
         for name, allowed in (("lidar", LIDARS), ("action_alignment", ACTION_ALIGNMENTS)):
             value = getattr(self, name, allowed[0])
             if value not in allowed:
-                raise ConfigError(
-                    f"{name} of a {self.kind} is {str(value)[:40]!r}, expected one of: {', '.join(allowed)}."
-                )
+                raise ConfigError(f"{name} of a {self.kind} is {str(value)!r}, expected one of: {', '.join(allowed)}.")
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as plain JSON values."""
@@ -65,7 +63,7 @@ class ModelConfig:
         for name in values:
             if name not in known:
                 raise ConfigError(
-                    f"A {cls.kind} has no setting {str(name)[:60]!r}.{did_you_mean(str(name), known)} "
+                    f"A {cls.kind} has no setting {str(name)!r}.{did_you_mean(str(name), known)} "
                     f"Known: {', '.join(known)}."
                 )
         return cls(**values)
@@ -250,6 +248,6 @@ class EndToEndConfig(ModelConfig):
 
 def _check_bounds(kind: str, squash: str, max_speed: float) -> None:
     if squash not in SQUASHES:
-        raise ConfigError(f"squash of a {kind} is {str(squash)[:40]!r}, expected one of: {', '.join(SQUASHES)}.")
+        raise ConfigError(f"squash of a {kind} is {str(squash)!r}, expected one of: {', '.join(SQUASHES)}.")
     if isinstance(max_speed, bool) or not isinstance(max_speed, int | float) or not 0.0 <= max_speed <= 10.0:
-        raise ConfigError(f"max_speed of a {kind} is {repr(max_speed)[:40]}, expected 0 (no limit) to 10 m/s.")
+        raise ConfigError(f"max_speed of a {kind} is {max_speed!r}, expected 0 (no limit) to 10 m/s.")

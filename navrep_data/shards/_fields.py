@@ -26,10 +26,9 @@ class Fields:
         self.values = values
 
     def bad(self, name: str, expected: str) -> CorruptDataError:
-        seen = repr(self.values.get(name, "missing"))
-        seen = seen if len(seen) <= 60 else seen[:57] + "..."
+        seen = self.values.get(name, "missing")
         raise CorruptDataError(
-            f"{self.path}: field '{self.prefix}{name}' is {seen}, expected {expected}; get the file again."
+            f"{self.path}: field '{self.prefix}{name}' is {seen!r}, expected {expected}; get the file again."
         )
 
     def get(self, name: str, kind: type) -> Any:

@@ -104,7 +104,7 @@ def column_order(names: Iterable[str]) -> tuple[str, ...]:
     for name in given:
         if name not in COLUMNS:
             raise ConfigError(
-                f"Unknown column {name[:60]!r}; expected some of {', '.join(COLUMNS)}.{did_you_mean(name, COLUMNS)}"
+                f"Unknown column {name!r}; expected some of {', '.join(COLUMNS)}.{did_you_mean(name, COLUMNS)}"
             )
         if given.count(name) > 1:
             raise ConfigError(f"Column {name!r} is named twice; expected each once.")

@@ -380,7 +380,7 @@ def check_license(license: Any) -> str:
     """Return what is wrong with a licence identifier, or an empty string."""
     if isinstance(license, str) and _LICENSE.fullmatch(license):
         return ""
-    return f"the licence is {str(license)[:60]!r}, expected an identifier such as cc-by-4.0, cc0-1.0, mit or other"
+    return f"the licence is {str(license)!r}, expected an identifier such as cc-by-4.0, cc0-1.0, mit or other"
 
 
 def _parse_sensor(fields: Fields) -> SensorContract:

@@ -68,7 +68,5 @@ def read_origin(root: Path | str) -> Origin | None:
     fields = Fields(read_json(path, _MAX_BYTES), path)
     origin = Origin(*(fields.get(name, str) for name in ("repo", "commit", "asked", "endpoint", "manifest_sha256")))
     if not (_COMMIT.fullmatch(origin.commit) and REPO_NAME.fullmatch(origin.repo)):
-        raise CorruptDataError(
-            f"{path} names {str(origin)[:120]!r}, expected user/name@commit; pull the dataset again."
-        )
+        raise CorruptDataError(f"{path} names {str(origin)!r}, expected user/name@commit; pull the dataset again.")
     return origin

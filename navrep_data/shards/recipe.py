@@ -56,5 +56,4 @@ def read_recipe(path: Path | str) -> ShardRecipe:
             raise ValueError("its attributes are not those of a shard")
         return ShardRecipe(str(values["env"]), json.loads(values["config"]), int(values["seed"]), int(values["length"]))
     except Exception as error:  # a damaged file makes the HDF5 library raise nearly anything
-        text = " ".join(str(error).split())[:200]
-        raise CorruptDataError(f"{path} cannot be read as a shard ({text}); get it again or make it again.") from error
+        raise CorruptDataError(f"{path} cannot be read as a shard ({error}); get it again or make it again.") from error

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from navrep_data.errors import NavrepDataError
+from navrep_data.errors import NavrepDataError, one_line
 from navrep_data.io import json_bytes, safe_join, sha256_bytes, sha256_file
 from navrep_data.observations import scan_to_rings
 from navrep_data.shards.card import dataset_card
@@ -47,8 +47,11 @@ class Problem:
     file: str
     what: str
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "what", one_line(self.what))
+
     def __str__(self) -> str:
-        return f"{self.file}: {self.what}"
+        return one_line(f"{self.file}: {self.what}")
 
 
 @dataclass

@@ -335,7 +335,7 @@ def parse_worlds(data: bytes, where: str) -> Worlds:
         if problem:
             raise ValueError(problem)
     except Exception as error:  # damaged zips raise a dozen kinds, NotImplementedError and struct.error among them
-        reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+        reason = str(error).strip().rstrip(".") or type(error).__name__
         raise CorruptDataError(f"{where} is not a worlds file: {reason}; {_ADVICE}.") from error
     return Worlds(arrays)
 

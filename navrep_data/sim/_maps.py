@@ -127,8 +127,7 @@ def read_description(path: Path, *, packaged: bool = False) -> MapDescription:
     try:
         content = yaml.load(path.read_bytes(), _MapLoader)  # a SafeLoader
     except Exception as error:  # values such as `!!int ''` make PyYAML raise nearly anything
-        said = " ".join(str(error).split())[:120]
-        raise MapError(f"{path} is not valid YAML ({said}): expected a map_server map file.") from error
+        raise MapError(f"{path} is not valid YAML ({error}): expected a map_server map file.") from error
     if not isinstance(content, dict):
         raise MapError(f"{path} holds {type(content).__name__}, expected keys {', '.join(_REQUIRED)}: no map file.")
     missing = [key for key in _REQUIRED if key not in content]
@@ -163,9 +162,9 @@ def read_description(path: Path, *, packaged: bool = False) -> MapDescription:
 
 
 def _seen(value: Any) -> str:
-    """Return the start of a value as text."""
+    """Return a value as text."""
     try:
-        return repr(str(value)[:40])
+        return repr(str(value))
     except ValueError:  # a whole number of more than 4300 digits has no text
         return "a number of thousands of digits"
 
@@ -202,17 +201,15 @@ def _image_path(path: Path, image: Any, packaged: bool) -> Path:
     windows = PureWindowsPath(image)
     if pure.is_absolute() or windows.is_absolute() or windows.drive or ".." in windows.parts:
         raise MapError(
-            f"{path}: image {image[:60]!r} is absolute or leaves the folder, expected a file beside the YAML file: "
+            f"{path}: image {image!r} is absolute or leaves the folder, expected a file beside the YAML file: "
             "copy the image there and name it."
         )
     found = path.resolve().parent / pure
     if not found.is_file():
-        raise MapError(
-            f"{path}: image {image[:60]!r} does not exist in {path.parent}: put it there or correct the name."
-        )
+        raise MapError(f"{path}: image {image!r} does not exist in {path.parent}: put it there or correct the name.")
     found = found.resolve()
     if not found.is_relative_to(path.resolve().parent):
-        raise MapError(f"{path}: image {image[:60]!r} is a link that leaves the folder: copy the image there instead.")
+        raise MapError(f"{path}: image {image!r} is a link that leaves the folder: copy the image there instead.")
     return found
 
 
@@ -247,8 +244,7 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
             f"{path} has far more pixels than expected, at most {MAX_PIXELS:,}: crop it or halve its resolution."
         ) from error
     except Exception as error:  # damaged images make pillow raise nearly anything, struct.error and KeyError among it
-        said = " ".join(str(error).split())[:120]
-        raise MapError(f"{path} cannot be read as an image ({said}): expected a PGM or PNG of 8-bit grey.") from error
+        raise MapError(f"{path} cannot be read as an image ({error}): expected a PGM or PNG of 8-bit grey.") from error
 
 
 def occupancy_of(grey: NDArray[np.uint8], rule: str, negate: bool) -> NDArray[np.float32]:

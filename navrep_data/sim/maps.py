@@ -128,7 +128,7 @@ def _find(name_or_path: str | os.PathLike[str]) -> tuple[Path, bool]:
     if is_folder:
         return yaml_in_folder(path), False
     raise UnknownNameError(
-        f"Unknown map '{text[:60]}'.{did_you_mean(text, names)} Expected one of {', '.join(names)}, or the path of a "
+        f"Unknown map '{text}'.{did_you_mean(text, names)} Expected one of {', '.join(names)}, or the path of a "
         "map_server YAML file."
     )
 

@@ -111,18 +111,16 @@ class ControllerRecipe:
         choices = {"features": (*FEATURES, "e2e"), "lidar": ("rings", "1d"), "precision": PRECISIONS}
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
-                raise ConfigError(
-                    f"{name} is {str(getattr(self, name))[:40]!r}, expected one of: {', '.join(allowed)}."
-                )
+                raise ConfigError(f"{name} is {str(getattr(self, name))!r}, expected one of: {', '.join(allowed)}.")
         for field in dataclasses.fields(self):
             value: Any = getattr(self, field.name)
             if field.type == "int" and (type(value) is not int or value < (0 if field.name == "seed" else 1)):
-                raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected a whole number of at least 1.")
+                raise ConfigError(f"{field.name} is {value!r}, expected a whole number of at least 1.")
             if field.type == "bool" and type(value) is not bool:
-                raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected true or false.")
+                raise ConfigError(f"{field.name} is {value!r}, expected true or false.")
             most = _MOST.get(field.name, 1e6)
             if field.type == "float" and (type(value) not in (int, float) or not 0 <= value <= most):
-                raise ConfigError(f"{field.name} is {repr(value)[:40]}, expected a number from 0 to {most:g}.")
+                raise ConfigError(f"{field.name} is {value!r}, expected a number from 0 to {most:g}.")
         if self.refit and self.features != "z":
             raise ConfigError(f"refit is for controllers on z, this is a recipe for {self.features}: leave it out.")
         if not 0.0 < self.least_std <= MOST_STD:

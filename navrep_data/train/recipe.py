@@ -191,16 +191,14 @@ class Recipe:
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
-                raise ConfigError(
-                    f"{name} is {str(getattr(self, name))[:40]!r}, expected one of: {', '.join(allowed)}."
-                )
+                raise ConfigError(f"{name} is {str(getattr(self, name))!r}, expected one of: {', '.join(allowed)}.")
         for field in dataclasses.fields(self):
             value: Any = getattr(self, field.name)
             wanted: tuple[type, ...] = {"int": (int,), "float": (int, float), "bool": (bool,), "str": (str,)}[
                 str(field.type)
             ]
             if not isinstance(value, wanted) or (type(value) is bool and field.type != "bool"):
-                raise ConfigError(f"{field.name} of a recipe is {str(value)[:40]!r}, expected {field.type}.")
+                raise ConfigError(f"{field.name} of a recipe is {str(value)!r}, expected {field.type}.")
             low, high = _LIMITS.get(field.name, (-math.inf, math.inf))
             number: Any = getattr(self, field.name)
             if field.type in ("int", "float") and not low <= number <= high:
@@ -234,8 +232,7 @@ class Recipe:
         for name in values:
             if name not in known:
                 raise ConfigError(
-                    f"A recipe has no setting {str(name)[:60]!r}.{did_you_mean(str(name), known)} "
-                    f"Known: {', '.join(known)}."
+                    f"A recipe has no setting {str(name)!r}.{did_you_mean(str(name), known)} Known: {', '.join(known)}."
                 )
         return cls(**values)
 

@@ -152,7 +152,7 @@ def last_folder(out: Path) -> Path | None:
     name = str(found.get("last", "")) if isinstance(found, dict) else ""
     folder = out / CHECKPOINTS / name
     if not re.fullmatch(r"step-\d{1,12}", name) or not (folder / _STATE).is_file():
-        raise CheckpointError(f"{path} names {name[:60]!r}, which is not there: start anew in another folder.")
+        raise CheckpointError(f"{path} names {name!r}, which is not there: start anew in another folder.")
     return folder
 
 
@@ -181,15 +181,14 @@ def load(
     try:
         tensors = safetensors.torch.load(data)
     except safetensors.SafetensorError as error:
-        said = " ".join(str(error).split())[:160]  # it may repeat what it read
-        raise CheckpointError(f"{path} is not a safetensors file ({said}).") from error
+        raise CheckpointError(f"{path} is not a safetensors file ({error}).") from error
     by_name = dict((trained or model).named_parameters())
     fused = {p for group in optimizer.param_groups if group.get("fused") for p in group["params"]}
     for key, tensor in tensors.items():
         if key.startswith("optimizer/"):
             name, _, what = key.removeprefix("optimizer/").rpartition("/")
             if name not in by_name or tensor.shape not in (by_name[name].shape, ()):
-                raise CheckpointError(f"{path} has a state of {name[:60]!r}, unknown in this network.")
+                raise CheckpointError(f"{path} has a state of {name!r}, unknown in this network.")
             parameter = by_name[name]
             # torch keeps the step counter on the CPU, unless it updates in one pass
             stays = what == "step" and parameter not in fused

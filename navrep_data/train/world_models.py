@@ -201,7 +201,7 @@ def claim(
     for name, value in settings.items():
         if name not in free and old.get(name) != value:
             raise ConfigError(
-                f"{out} was started with {name} = {repr(old.get(name))[:40]}, this resume has {value}: use the "
+                f"{out} was started with {name} = {old.get(name)!r}, this resume has {value}: use the "
                 f"settings in {path}, or start anew in another folder."
             )
     for name in ("content_hash", "encoder", "world_model_sha256"):

@@ -111,7 +111,7 @@ def read_policy(folder: Path | str) -> dict[str, Any]:
         raise CheckpointError(f"{path} is not the description of a policy (no format {POLICY_FORMAT!r}).")
     if found.get("format_version") != POLICY_VERSION:
         raise CheckpointError(
-            f"{path} has format version {repr(found.get('format_version'))[:20]}, expected {POLICY_VERSION}: install a "
+            f"{path} has format version {found.get('format_version')!r}, expected {POLICY_VERSION}: install a "
             "newer navrep-data."
         )
     check_described(found, path, {"parts": ([CONTROLLER], [CONTROLLER, "world_model"], [CONTROLLER, "vae"])})
@@ -137,7 +137,7 @@ def check_described(found: Mapping[str, Any], path: Path, more: Mapping[str, tup
     }
     for name, values in allowed.items():
         if found.get(name) not in values:
-            raise CheckpointError(f"{path}: {name} is {str(found.get(name))[:60]!r}, expected one of: {values}.")
+            raise CheckpointError(f"{path}: {name} is {str(found.get(name))!r}, expected one of: {values}.")
     sensor = found.get("sensor")
     if not isinstance(sensor, dict) or any(type(v) not in (int, float) for v in sensor.values()):
         sensor = {}

@@ -198,7 +198,7 @@ def _wanted(at: client.Revision, path: Path) -> list[FileEntry]:
     for entry in listed:
         name, digest, size = (entry.get(k) if isinstance(entry, dict) else None for k in ("file", "sha256", "bytes"))
         if not isinstance(name, str) or not _NAMES.fullmatch(name):
-            raise CorruptDataError(f"{at} names a file {str(name)[:80]!r}, expected one of a checkpoint or policy.")
+            raise CorruptDataError(f"{at} names a file {str(name)!r}, expected one of a checkpoint or policy.")
         if (
             not isinstance(digest, str)
             or not re.fullmatch(r"[0-9a-f]{64}", digest)

@@ -38,9 +38,7 @@ def zip_members(path: Path, limit: int) -> dict[str, zipfile.ZipInfo]:
         with zipfile.ZipFile(path) as archive:
             infos = archive.infolist()
     except Exception as error:  # damaged archives raise a dozen kinds, struct.error among them
-        raise CheckpointError(
-            f"{path} is no zip file ({str(error)[:80]}); pickles are never read, so expected a zip."
-        ) from error
+        raise CheckpointError(f"{path} is no zip file ({error}); pickles are never read, so expected a zip.") from error
     total = sum(info.file_size for info in infos)
     members = {info.filename: info for info in infos}
     if len(infos) > MAX_MEMBERS or len(members) != len(infos) or total > limit:
@@ -59,4 +57,4 @@ def read_member(path: Path, info: zipfile.ZipInfo) -> bytes:
         with zipfile.ZipFile(path) as archive, archive.open(info) as member:
             return member.read(info.file_size)
     except Exception as error:  # zlib.error among them
-        raise CheckpointError(f"{path}: {info.filename[:80]!r} cannot be unpacked ({str(error)[:80]}).") from error
+        raise CheckpointError(f"{path}: {info.filename!r} cannot be unpacked ({error}).") from error

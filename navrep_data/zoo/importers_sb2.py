@@ -94,7 +94,7 @@ def load_controller_zip(path: Path | str) -> Controller | EndToEnd:
     members = zip_members(path, limit)
     if sorted(members) != sorted(_MEMBERS):
         raise CheckpointError(
-            f"{path} holds {', '.join(sorted(members))[:100] or 'nothing'}, expected {', '.join(_MEMBERS)}: it is "
+            f"{path} holds {', '.join(sorted(members)) or 'nothing'}, expected {', '.join(_MEMBERS)}: it is "
             "no zip of stable-baselines 2."
         )
     for name, bound in (("data", _MAX_DATA), ("parameter_list", HEADROOM), ("parameters", limit)):
@@ -106,7 +106,7 @@ def load_controller_zip(path: Path | str) -> Controller | EndToEnd:
     try:
         names = json.loads(listed)
     except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"{path}: 'parameter_list' is not valid JSON ({str(error)[:80]}).") from error
+        raise CheckpointError(f"{path}: 'parameter_list' is not valid JSON ({error}).") from error
     arrays_file = read_member(path, members["parameters"])
     shapes = _which_network(names, _array_headers(arrays_file, path), path)
     arrays = _read_arrays(arrays_file, shapes, path)
@@ -129,7 +129,7 @@ def _which_network(names: Any, found: dict[str, tuple[int, ...]], path: Path) ->
         raise CheckpointError(f"{path}: 'parameter_list' names no network of NavRep's.")
     wrong = next((n for n in sorted({*known, *found}) if known.get(n) != found.get(n)), "")
     raise CheckpointError(
-        f"{path}: {wrong[:80]!r} has shape {found.get(wrong)}, expected {known.get(wrong)} in a network of NavRep's."
+        f"{path}: {wrong!r} has shape {found.get(wrong)}, expected {known.get(wrong)} in a network of NavRep's."
     )
 
 
@@ -153,14 +153,14 @@ def _array_headers(data: bytes, path: Path) -> dict[str, tuple[int, ...]]:
                 shape, _, dtype = np.lib.format.read_array_header_1_0(head)
                 if dtype != np.float32 or head.tell() + 4 * math.prod(shape) != info.file_size or name in shapes:
                     raise CheckpointError(
-                        f"{path}: array {name[:80]!r} claims shape {shape} and dtype {dtype} in {info.file_size:,} "
+                        f"{path}: array {name!r} claims shape {shape} and dtype {dtype} in {info.file_size:,} "
                         "bytes, expected float32 and as many bytes as that takes."
                     )
                 shapes[name] = shape
     except Exception as error:  # damaged archives raise a dozen kinds, struct.error and zlib.error among them
         if isinstance(error, CheckpointError):
             raise
-        raise CheckpointError(f"{path}: 'parameters' is no npz of plain arrays ({str(error)[:80]}).") from error
+        raise CheckpointError(f"{path}: 'parameters' is no npz of plain arrays ({error}).") from error
     return shapes
 
 
@@ -169,7 +169,7 @@ def _read_arrays(data: bytes, shapes: ArrayShapes, path: Path) -> Arrays:
         with np.load(io.BytesIO(data), allow_pickle=False) as npz:
             return {name: np.ascontiguousarray(npz[name]) for name, _ in shapes}
     except Exception as error:
-        raise CheckpointError(f"{path}: 'parameters' cannot be read ({str(error)[:80]}).") from error
+        raise CheckpointError(f"{path}: 'parameters' cannot be read ({error}).") from error
 
 
 def _network_of(arrays: Arrays) -> Controller | EndToEnd:

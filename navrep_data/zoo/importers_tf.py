@@ -100,7 +100,7 @@ def load_tf_json(path: Path | str, kind: str | None) -> VAE | MDNRNN:
     try:
         lists = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"{path} is not valid JSON ({str(error)[:80]}); get it again.") from error
+        raise CheckpointError(f"{path} is not valid JSON ({error}); get it again.") from error
     if kind is None:
         kind = _guess_kind(lists, path)
     arrays = _integer_arrays(lists, _TF_KINDS[kind], path)

@@ -57,7 +57,7 @@ def load_torch_world_model(path: Path | str) -> WorldModel:
     try:
         loaded = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as error:  # a damaged pickle makes torch raise nearly anything
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise CheckpointError(
             f"{path} is no plain torch state dict, and nothing else is read from pickles ({reason})."
         ) from error
@@ -76,12 +76,12 @@ def _check_ingredients(data: bytes, path: Path) -> None:
             named = code.name in ("GLOBAL", "INST", "STACK_GLOBAL", "EXT1", "EXT2", "EXT4")
             if named and argument not in _INGREDIENTS:
                 raise CheckpointError(
-                    f"{path} is no plain torch state dict: it names {str(argument)[:60]!r}, which is not run."
+                    f"{path} is no plain torch state dict: it names {str(argument)!r}, which is not run."
                 )
     except Exception as error:  # damaged opcodes raise more than ValueError
         if isinstance(error, CheckpointError):
             raise
-        raise CheckpointError(f"{path} is no plain torch state dict ({str(error)[:80]}).") from error
+        raise CheckpointError(f"{path} is no plain torch state dict ({error}).") from error
 
 
 def _check_storages(loaded: dict[str, Tensor], members: dict[str, zipfile.ZipInfo], path: Path) -> None:
@@ -89,7 +89,7 @@ def _check_storages(loaded: dict[str, Tensor], members: dict[str, zipfile.ZipInf
     claimed: dict[int, int] = {}
     for name, value in loaded.items():
         if value.layout != torch.strided:
-            raise CheckpointError(f"{path}: {name[:80]!r} is {value.layout}, expected a plain (strided) tensor.")
+            raise CheckpointError(f"{path}: {name!r} is {value.layout}, expected a plain (strided) tensor.")
         storage = value.untyped_storage()
         claimed[storage.data_ptr()] = storage.nbytes()
     stored = sum(info.file_size for name, info in members.items() if "/data/" in name)
@@ -125,7 +125,7 @@ def _world_model_from_state(loaded: dict[str, Tensor], path: Path) -> WorldModel
     state: dict[str, Tensor] = {}
     for name, value in loaded.items():
         if name not in shapes:
-            raise CheckpointError(f"{path} has weights {name[:80]!r}, unknown in a {kind} model for {lidar}.")
+            raise CheckpointError(f"{path} has weights {name!r}, unknown in a {kind} model for {lidar}.")
         if tuple(value.shape) != shapes[name] or value.dtype != torch.float32:
             raise CheckpointError(
                 f"{path}: {name!r} has shape {tuple(value.shape)} and {value.dtype}, expected {shapes[name]} and "

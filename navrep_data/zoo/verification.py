@@ -193,7 +193,7 @@ def _check(record: Record, where: Source, golden: Path | None) -> Check:
             else:
                 absent.append(name)
     except NavrepDataError as error:
-        problems.append(f"{path}: {' '.join(str(error).split())}")
+        problems.append(f"{path}: {error}")
     problems += [
         f"{c.file}: {c.output} differs by {c.error:.3g}, expected at most {c.tolerance:.3g}"
         for c in comparisons

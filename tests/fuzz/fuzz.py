@@ -5,6 +5,9 @@ Each target (:mod:`fuzz_targets`) runs in a process of its own whose address spa
 :mod:`navrep_data.errors` on one line. Anything else is a finding: another exception, memory that ran out or grew by
 more than :data:`MEMORY`, a read that takes more than :data:`HANG` or :data:`STANDSTILL`, a process that dies, a file
 outside the folder. Exit code 1 if there is one; its files are kept.
+
+With ``--examples N``, as in `make test`, nothing depends on the clock or on chance: each target reads N changed files
+that follow from the seed (0 by default) alone, and only the processor's time is bounded.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import argparse
 import faulthandler
 import json
 import os
+import random
 import resource
 import shutil
 import signal
@@ -21,17 +25,17 @@ import tempfile
 import time
 import traceback
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 import hypothesis
-from fuzz_edits import EDITS, OUTSIDE, Edit, Files, apply
+from fuzz_edits import BOUNDS, EDITS, MOST_EDITS, OUTSIDE, Edit, Files, apply
 from fuzz_targets import TARGETS, Target, load_files
 from hypothesis import strategies as st
 
-from navrep_data.errors import NavrepDataError
+from navrep_data.errors import LONGEST_MESSAGE, NavrepDataError
 
 MEMORY = 512 << 20
 """Bytes that reading one small file may take at most."""
@@ -40,9 +44,9 @@ ADDRESS_SPACE = 1 << 30
 HANG = 20.0
 """Seconds of the processor's time that reading one small file may take at most."""
 STANDSTILL = 600.0
-"""Seconds by the clock that it may take; long, since whole machines are stopped and go on."""
+"""Seconds by the clock that it may take; long, since whole machines are stopped and go on. Not looked at where the
+number of examples is given."""
 _ROUND = 250
-_LONGEST_MESSAGE = 2000
 
 
 @dataclass
@@ -69,6 +73,25 @@ class Report:
     finding: str = ""
 
 
+@dataclass(frozen=True)
+class Much:
+    """How much is fuzzed.
+
+    Attributes
+    ----------
+    seconds : float
+        How long, where no number of examples is given.
+    examples : int, optional
+        How many changed files are read, however long that takes.
+    standstill : float, optional
+        Seconds by the clock that reading one may take; None: as long as it wants.
+    """
+
+    seconds: float = 0.0
+    examples: int | None = None
+    standstill: float | None = STANDSTILL
+
+
 class _Found(Exception):  # noqa: N818
     """A reader did what it must not do."""
 
@@ -76,13 +99,24 @@ class _Found(Exception):  # noqa: N818
 class _Fuzzer:
     """One target in this process."""
 
-    def __init__(self, target: Target, files: Files, work: Path) -> None:
+    def __init__(self, target: Target, files: Files, work: Path, standstill: float | None) -> None:
+        self.standstill = standstill
         self.target, self.files, self.report = target, files, Report(target.name)
         self.case, self.outside = work / "case", work / Path(OUTSIDE).name
         self.outside.write_text("not to be touched")
         self.around = [*sorted(p.name for p in work.iterdir()), "case"]
-        self._read(self.files)  # a target whose own files are refused would find nothing
+        self._write(self.files)
+        # a target whose own files are refused would find nothing; no limit here, reading may compile kernels first
         target.read(self.case)
+
+    def run_fixed(self, examples: int, seed: int) -> None:
+        """Read `examples` changed files, the same ones at every run."""
+        start = time.monotonic()
+        for k in range(examples):
+            draw = random.Random(f"{seed} {self.target.name} {k}")
+            edits = [Edit(*(draw.randrange(bound) for bound in BOUNDS)) for _ in range(draw.randint(1, MOST_EDITS))]
+            self._example(edits, sealed=draw.randrange(8) > 0)
+        self.report.seconds = time.monotonic() - start
 
     def run(self, end: float, seed: int) -> None:
         """Read changed files until `end`."""
@@ -118,15 +152,19 @@ class _Fuzzer:
         self.report.taken += taken
         self.report.refused += not taken
 
-    def _read(self, files: Files) -> bool:
-        """Read files and say whether they were taken; raise for what must not happen."""
+    def _write(self, files: Files) -> None:
         shutil.rmtree(self.case, ignore_errors=True)
         for name, data in files.items():
             path = self.case / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
+
+    def _read(self, files: Files) -> bool:
+        """Read files and say whether they were taken; raise for what must not happen."""
+        self._write(files)
         before = _reset_peak()
-        faulthandler.dump_traceback_later(STANDSTILL, exit=True)
+        if self.standstill is not None:
+            faulthandler.dump_traceback_later(self.standstill, exit=True)
         signal.setitimer(signal.ITIMER_PROF, HANG)  # its signal ends the process, wherever it is
         try:
             self.target.read(self.case)
@@ -154,7 +192,7 @@ def _check_refusal(error: NavrepDataError) -> None:
             raise _Found(f"memory ran out before it was refused: {error}") from error
         cause = cause.__cause__ or cause.__context__
     text = str(error)
-    if len(text) > _LONGEST_MESSAGE or "\n" in text:
+    if len(text) > LONGEST_MESSAGE or len(text.splitlines()) > 1:
         raise _Found(f"the message has {len(text)} characters or several lines: {text[:300]!r}") from error
     text.encode()
 
@@ -175,7 +213,7 @@ def _peak() -> int:
     return _status("VmHWM")
 
 
-def _child(target: Target, files: Files, work: Path, seconds: float, seed: int) -> None:
+def _child(target: Target, files: Files, work: Path, much: Much, seed: int) -> None:
     """Fuzz one target and write its report; ends the process."""
     warnings.simplefilter("ignore")
     faulthandler.enable()
@@ -186,11 +224,14 @@ def _child(target: Target, files: Files, work: Path, seconds: float, seed: int) 
     fuzzer = None
     report = Report(target.name)
     try:
-        fuzzer = _Fuzzer(target, files, work)
+        fuzzer = _Fuzzer(target, files, work, much.standstill)
         report = fuzzer.report
         limit = _status("VmSize") + ADDRESS_SPACE
         resource.setrlimit(resource.RLIMIT_AS, (limit, resource.getrlimit(resource.RLIMIT_AS)[1]))
-        fuzzer.run(time.monotonic() + seconds, seed)
+        if much.examples is not None:
+            fuzzer.run_fixed(much.examples, seed)
+        else:
+            fuzzer.run(time.monotonic() + much.seconds, seed)
     except BaseException as error:
         report.finding = report.finding or "".join(traceback.format_exception(error))
     resource.setrlimit(resource.RLIMIT_AS, (resource.getrlimit(resource.RLIMIT_AS)[1],) * 2)
@@ -198,34 +239,35 @@ def _child(target: Target, files: Files, work: Path, seconds: float, seed: int) 
 
 
 _DIED, _EDITING, _READING = "the process died", "in edit_hdf5", "in _read"
+_NEXT_SEED, _OTHER_SEEDS = 1_000_000, 5
 
 
-def fuzz(target: Target, seconds: float, seed: int, keep: Path | None = None) -> Report:
+def fuzz(target: Target, much: Much, seed: int, keep: Path | None = None) -> Report:
     """Fuzz one target; go on with another seed where the fuzzer itself dies while it edits an HDF5 file.
 
     Parameters as for :func:`fuzz_once`. libhdf5 may crash when it writes into a file that earlier edits have damaged;
     that says nothing about the readers, which the process had not called.
     """
-    end = time.monotonic() + seconds
+    end = time.monotonic() + much.seconds
     while True:
-        report = fuzz_once(target, max(1.0, end - time.monotonic()), seed, keep)
+        report = fuzz_once(target, replace(much, seconds=max(1.0, end - time.monotonic())), seed, keep)
         own = report.finding is not None and _DIED in report.finding and _EDITING in report.finding
         if not own or _READING in str(report.finding):
             return report
-        seed += 1_000_000
-        if time.monotonic() > end:
+        if time.monotonic() > end and (much.examples is None or seed >= _OTHER_SEEDS * _NEXT_SEED):
             return Report(target.name)
+        seed += _NEXT_SEED
 
 
-def fuzz_once(target: Target, seconds: float, seed: int, keep: Path | None = None) -> Report:
+def fuzz_once(target: Target, much: Much, seed: int, keep: Path | None = None) -> Report:
     """Fuzz one target in a process of its own.
 
     Parameters
     ----------
     target : Target
         What to read.
-    seconds : float
-        How long.
+    much : Much
+        How long, or how many examples.
     seed : int
         Same seed, same examples (as many of them as time allows).
     keep : Path, optional
@@ -247,7 +289,7 @@ def fuzz_once(target: Target, seconds: float, seed: int, keep: Path | None = Non
             inner = work / "work"
             inner.mkdir()
             try:
-                _child(target, files, inner, seconds, seed)
+                _child(target, files, inner, much, seed)
             finally:
                 os._exit(0)
         _, status = os.waitpid(pid, 0)
@@ -269,17 +311,27 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns 1 where something was found."""
     parser = argparse.ArgumentParser(description="Fuzz the readers of files from outside.")
     parser.add_argument("--seconds", type=float, default=600.0, help="time in all, shared out over the targets")
-    parser.add_argument("--seed", type=int, default=None, help="same seed, same examples; random by default")
+    parser.add_argument("--examples", type=int, default=None, help="so many for each target, however long that takes")
+    parser.add_argument(
+        "--seed", type=int, default=None, help="same seed, same examples; random by default, 0 with --examples"
+    )
     parser.add_argument("--only", nargs="*", choices=[t.name for t in TARGETS], help="these targets")
     parser.add_argument("--keep", type=Path, default=Path("fuzz-findings"), help="where the files of findings go")
     options = parser.parse_args(arguments)
-    seed = int.from_bytes(os.urandom(4), "little") if options.seed is None else options.seed
+    seed = options.seed
+    if seed is None:
+        seed = int.from_bytes(os.urandom(4), "little") if options.examples is None else 0
     targets = [t for t in TARGETS if not options.only or t.name in options.only]
-    print(f"seed {seed}, {options.seconds:g} s for {len(targets)} targets", flush=True)
+    if options.examples is None:
+        much = Much(options.seconds / len(targets))
+        print(f"seed {seed}, {options.seconds:g} s for {len(targets)} targets", flush=True)
+    else:
+        much = Much(examples=options.examples, standstill=None)
+        print(f"seed {seed}, {options.examples} examples for each of {len(targets)} targets", flush=True)
     _import_all()
     reports = []
     for target in targets:
-        report = fuzz(target, options.seconds / len(targets), seed, options.keep)
+        report = fuzz(target, much, seed, options.keep)
         reports.append(report)
         outcome = "FOUND" if report.finding else "clean"
         print(

@@ -40,17 +40,11 @@ class Edit:
     value: int
 
 
-EDITS = st.lists(
-    st.builds(
-        Edit,
-        st.integers(0, 63),
-        st.integers(0, 255),
-        st.integers(0, (1 << 32) - 1),
-        st.integers(0, (1 << 32) - 1),
-    ),
-    min_size=1,
-    max_size=4,
-)
+BOUNDS = (64, 256, 1 << 32, 1 << 32)
+"""The numbers of an edit are lower than these."""
+MOST_EDITS = 4
+"""Changes to the files of one case."""
+EDITS = st.lists(st.builds(Edit, *(st.integers(0, bound - 1) for bound in BOUNDS)), min_size=1, max_size=MOST_EDITS)
 
 
 def apply(files: Files, edits: list[Edit]) -> Files:

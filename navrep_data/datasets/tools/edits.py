@@ -326,4 +326,4 @@ def parse_shares(text: str) -> dict[str, float]:
     try:
         return dict(zip(SPLITS, map(float, text.split(",")), strict=True))
     except ValueError:
-        raise ConfigError(f"--shares is {text[:60]!r}; expected train,val,test as in 0.7,0.2,0.1.") from None
+        raise ConfigError(f"--shares is {text!r}; expected train,val,test as in 0.7,0.2,0.1.") from None

@@ -1,0 +1,69 @@
+"""Messages: one line, of bounded length, whatever text from outside they quote; nothing else of them changes."""
+
+import pickle
+import re
+from pathlib import Path
+
+import pytest
+
+from navrep_data import errors
+from navrep_data.doctor.installation import Check
+from navrep_data.errors import LONGEST_MESSAGE, NavrepDataError, one_line
+from navrep_data.shards._fields import Fields
+from navrep_data.shards.verify import Problem
+
+CLASSES = [c for c in vars(errors).values() if isinstance(c, type) and issubclass(c, NavrepDataError)]
+ORDINARY = "Unknown model 'a  b\u3000\u00e9'. Did you mean 'ab'? List all: navrep-data models"
+
+
+@pytest.mark.parametrize("kind", CLASSES, ids=lambda kind: kind.__name__)
+def test_what_every_error_shows(kind):
+    assert str(kind(ORDINARY)) == ORDINARY
+    long = kind(f"/data/x.zip: {'a' * 5114!r} cannot be unpacked: get it again.")
+    assert len(str(long)) == LONGEST_MESSAGE
+    assert str(long).startswith("/data/x.zip: 'aaa")
+    assert str(long).endswith("aaa' cannot be unpacked: get it again.")
+    assert str(pickle.loads(pickle.dumps(long))) == str(long)  # noqa: S301
+    assert str(kind("a file\n  of two\r\n\tlines\u2028or more\n")) == "a file of two lines or more"
+
+
+def test_text_that_steers_a_terminal_or_cannot_be_written():
+    assert one_line("red \x1b[31m, bell \x07, byte \udcff, \x9b1m") == r"red \x1b[31m, bell \x07, byte \udcff, \x9b1m"
+    one_line("\udcff" * 100_000).encode()
+    assert len(one_line("\x1b" * 100_000)) == LONGEST_MESSAGE
+    assert one_line("a" * LONGEST_MESSAGE) == "a" * LONGEST_MESSAGE
+    assert len(one_line("a" * 50_000_000)) == LONGEST_MESSAGE
+
+
+def test_findings_of_reports_are_lines_too():
+    for finding in (Problem("data/x.h5", "a\nb" * 4000), Check("python", "problem", "a\nb" * 4000)):
+        assert len(finding.what) == LONGEST_MESSAGE
+        assert "\n" not in finding.what
+
+
+def test_a_value_of_any_size_leaves_the_advice(tmp_path):
+    fields = Fields({"length": ["x" * 400] * 50}, tmp_path / "manifest.json")
+    with pytest.raises(errors.CorruptDataError) as refused:
+        fields.count("length")
+    said = str(refused.value)
+    assert said.startswith(f"{tmp_path / 'manifest.json'}: field 'length' is ['xxx")
+    assert said.endswith("; get the file again.")
+    assert len(said) == LONGEST_MESSAGE
+
+
+CUT = re.compile(
+    r"""(str|repr)\([^()]*(\([^()]*\)[^()]*)*\)\[:(?!12\])\d+\]"""  # the start of a text; [:12] is a hash's
+    r"""|" "\.join\([^\n]*\.split\(\)\)|' '\.join\([^\n]*\.split\(\)\)"""
+    r"""|\{[\w.]+\[:\d+\]!r\}"""
+)
+
+
+def test_no_other_place_cuts_texts():
+    package = Path(errors.__file__).parent
+    found = [
+        f"{path.relative_to(package)}:{k}: {line.strip()}"
+        for path in sorted(package.rglob("*.py"))
+        for k, line in enumerate(path.read_text().splitlines(), 1)
+        if CUT.search(line)
+    ]
+    assert found == []
