@@ -1,6 +1,6 @@
 """Every exception of the package.
 
-Each class inherits from :class:`NavrepDataError`, so that one ``except`` catches them all, and from the builtin
+Each error inherits from :class:`NavrepDataError`, so that one ``except`` catches them all, and from the builtin
 that a caller would expect there. Messages are one line: what was seen, what was expected, what to do. They quote names
 and texts from outside as they are; :func:`one_line` makes what is shown of them harmless, here and nowhere else.
 """
@@ -154,6 +154,10 @@ class HubError(NavrepDataError, OSError):
 
 class ModelNotFoundError(NavrepDataError, FileNotFoundError):
     """A checkpoint's file is neither in the given folder nor in the cache, and no network was asked or has it."""
+
+
+class BlindSectorWarning(UserWarning):
+    """Scans have directions that nobody saw, and nothing says that this is known."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -15,7 +15,7 @@ from navrep_data.datasets._buffers import BufferPool
 from navrep_data.datasets._index import Ints
 from navrep_data.datasets._rows import ranges
 from navrep_data.errors import ConfigError, UnknownNameError, did_you_mean
-from navrep_data.observations import scan_to_rings
+from navrep_data.observations import fill_blind, scan_to_rings
 
 Array = npt.NDArray[Any]
 Lidar = Literal["rings", "1d"]
@@ -53,6 +53,8 @@ class BatchSpec:
         Whether scans are divided by `range_max`.
     invalid : float
         What a stored 0 of a scan becomes [m].
+    fill : bool
+        Whether those become what :func:`navrep_data.observations.fill_blind` shows models instead.
     range_max : float
         The sensor's range [m].
     columns : frozenset of str
@@ -66,6 +68,7 @@ class BatchSpec:
     blank: bool
     normalized: bool
     invalid: float
+    fill: bool
     range_max: float
     columns: frozenset[str]
 
@@ -198,6 +201,14 @@ class Assembler:
         out = self.pool.empty((len(start), spec.window, scans.shape[1]), np.float32)
         kernel = _kernels.millimetre_windows if scans.dtype == np.uint16 else _kernels.metre_windows
         scale = np.float32(spec.range_max if spec.normalized else 1.0)
+        if spec.fill:
+            kernel(scans, start, count, np.float32(0.0), np.float32(1.0), out)
+            real = np.arange(spec.window) < count[:, None]  # rows that do not exist stay 0
+            if (out[real] == 0.0).any():
+                out[real] = fill_blind(out[real])
+            if spec.normalized:
+                out /= scale
+            return out
         kernel(scans, start, count, np.float32(spec.invalid), scale, out)
         return out
 

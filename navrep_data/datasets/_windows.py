@@ -20,7 +20,7 @@ from navrep_data.shards import DatasetFolder, Episodes
 Batch = dict[str, torch.Tensor]
 Split = Literal["train", "val", "test"]
 ScanUnit = Literal["metres", "normalized"]
-Invalid = Literal["zero", "range_max"]
+Invalid = Literal["zero", "near", "range_max"]
 
 
 def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
@@ -57,7 +57,7 @@ def make_spec(
     """Check the arguments that all datasets share against the dataset and return what a batch is to hold."""
     check_choice("action", action, ("taken", "leading"))
     check_choice("scan_unit", scan_unit, ("metres", "normalized"))
-    check_choice("invalid", invalid, ("zero", "range_max"))
+    check_choice("invalid", invalid, ("zero", "near", "range_max"))
     columns = frozenset(folder.manifest.columns)
     range_max = float(folder.manifest.sensor.range_max)
     return BatchSpec(
@@ -68,6 +68,7 @@ def make_spec(
         blank=blank,
         normalized=scan_unit == "normalized",
         invalid=range_max if invalid == "range_max" else 0.0,
+        fill=invalid == "near",
         range_max=range_max,
         columns=columns,
     )

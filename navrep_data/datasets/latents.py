@@ -282,7 +282,7 @@ class LatentDataset(Dataset[Batch]):
         self._rows, episodes = self._load(split)
         self.spec = BatchSpec(
             window=window, fields=_FIELDS, leading=action == "leading", targets=False, blank=False, normalized=False,
-            invalid=0.0, range_max=1.0, columns=frozenset(_COLUMNS),
+            invalid=0.0, fill=False, range_max=1.0, columns=frozenset(_COLUMNS),
         )  # fmt: skip
         self._assemble = Assembler(self.spec)
         self.table = (_whole_windows if across_episodes else within_episodes)(episodes, window, stride)

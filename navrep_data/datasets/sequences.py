@@ -58,10 +58,11 @@ class SequenceDataset(WindowDataset):
         Scans in metres, or divided by the sensor's range_max without clipping. Metres by default: that is
         what the word scan means everywhere in this package, and the released models differ in what they
         divide by.
-    invalid : {"zero", "range_max"}
-        What an invalid ray (stored as 0) becomes. Zero by default: it stays recognisable, rings ignore it,
-        and so ``scan_to_rings(scan)`` equals the stored rings; ``range_max`` suits models that would take 0
-        for a wall.
+    invalid : {"zero", "near", "range_max"}
+        What a ray that nobody saw (stored as 0) becomes. Zero by default: it stays recognisable, and so
+        ``scan_to_rings(scan)`` equals the stored rings. ``near``: what models that read ranges are shown, in training
+        and on a robot (:func:`navrep_data.observations.fill_blind`), since they would take 0 for a wall.
+        ``range_max``: free.
     preload : bool
         Decode everything once and hold it in memory as stored (2.2 kB per row for scans, 4.1 kB for rings).
         Forked workers share it; spawned workers load their own.

@@ -234,7 +234,7 @@ def _check_sequence(sequence: _Sequence, manifest: Manifest, add: _Collector) ->
     inner[sequence.starts[1:] - 1] = False
     state = sequence.columns["robot_state"].astype(np.float64)
     speed = np.hypot(state[:, 2], state[:, 3])
-    add.all("sensor", where, _scans(sequence.columns["scan"], speed, inner))
+    add.all("sensor", where, _scans(sequence.columns["scan"], speed, inner, declared_blind(manifest)))
     pose = sequence.columns.get("robot_pose")
     posed = pose is not None and bool(np.isfinite(pose).all())
     if pose is None or not posed:
@@ -247,13 +247,31 @@ def _check_sequence(sequence: _Sequence, manifest: Manifest, add: _Collector) ->
     return True
 
 
-def _scans(scan: Array, speed: Array, inner: Array) -> Iterator[str]:
+def declared_blind(manifest: Manifest) -> NDArray[np.bool_]:
+    """Return which rays nobody sees, as the dataset or one that it was made from says, shape (n_rays,), bool.
+
+    Notes
+    -----
+    ``config["blind_rays"]`` of a manifest: pairs [first, last] of ray numbers. ``import-rosbag`` writes it.
+    """
+    blind = np.zeros(manifest.sensor.n_rays, np.bool_)
+    for config in (manifest.config, *(record.get("config") for record in manifest.source)):
+        pairs = config.get("blind_rays") if isinstance(config, dict) else None
+        for pair in pairs if isinstance(pairs, list | tuple) else ():
+            if isinstance(pair, list | tuple) and len(pair) == 2 and all(type(k) is int and k >= 0 for k in pair):
+                blind[pair[0] : pair[1] + 1] = True
+    return blind
+
+
+def _scans(scan: Array, speed: Array, inner: Array, blind: NDArray[np.bool_]) -> Iterator[str]:
     """Yield what no working lidar would do."""
     if len(scan) < _MIN_ROWS:
         return
-    dead = int((scan == 0).all(axis=0).sum())
+    unseen = (scan == 0).all(axis=0)
+    dead = int((unseen & ~blind).sum())
     if dead:
-        yield f"{dead} of {scan.shape[1]} rays are invalid (0) on every row"
+        beside = f", beside {int((unseen & blind).sum())} that are declared blind" if blind.any() else ""
+        yield f"{dead} of {scan.shape[1]} rays are invalid (0) on every row{beside}"
     moving = inner & (speed[1:] > MIN_SPEED)
     if moving.sum() < _MIN_ROWS:
         return

@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from navrep_data.errors import ConfigError
-from navrep_data.observations import rings_to_float, scan_to_1d, scan_to_rings
+from navrep_data.observations import fill_blind, rings_to_float, scan_to_1d, scan_to_rings
 from navrep_data.schema import RINGS_SHAPE, SensorContract
 
 F32 = NDArray[np.float32]
@@ -63,7 +63,7 @@ def _scan1d(env: Any, space: gymnasium.Space[Any]) -> tuple[gymnasium.Space[Any]
     range_max = _sensor(env).range_max
 
     def transform(observation: dict[str, Any]) -> dict[str, Any]:
-        scan = scan_to_1d(observation["scan"], range_max)
+        scan = scan_to_1d(fill_blind(observation["scan"]), range_max)
         return {"1d": scan, "robot_state": observation["robot_state"]}
 
     scan_space = gymnasium.spaces.Box(0.0, 1.0, shape, np.float32)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from navrep_data.evaluate import _dwa
 from navrep_data.evaluate.pilots import Pilot
 from navrep_data.evaluate.worlds import Worlds
+from navrep_data.observations import fill_blind
 
 F64 = NDArray[np.float64]
 
@@ -122,7 +123,7 @@ class DwaPilot(Pilot):
         targets = _to_robot_frame(worlds.targets() - poses[:, :2], poses[:, 2])
         chosen = np.zeros((worlds.n, 2))
         points = np.zeros((sensor.n_rays, 2))
-        _dwa.choose_all(worlds.scans(), worlds.robot_states(), targets, worlds.radii(), s, points, chosen)
+        _dwa.choose_all(fill_blind(worlds.scans()), worlds.robot_states(), targets, worlds.radii(), s, points, chosen)
         actions = np.zeros((worlds.n, 3))
         actions[:, :2] = chosen / worlds.speed()
         return actions

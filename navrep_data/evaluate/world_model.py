@@ -181,7 +181,7 @@ def _open(lidar: Any, alignment: Any, data: Path, split: Any, window: int) -> Se
             )
     return SequenceDataset(
         data, lidar, window=window + 1, stride=window, split=split, fields=["robot_state", "action", "goal_valid"],
-        action=alignment, scan_unit="normalized", invalid="range_max",
+        action=alignment, scan_unit="normalized", invalid="near",
     )  # fmt: skip
 
 

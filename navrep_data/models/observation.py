@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from navrep_data.observations import rings_to_float, scan_to_1d, scan_to_rings
+from navrep_data.observations import fill_blind, rings_to_float, scan_to_1d, scan_to_rings
 
 
 def observation_from_scan(scan: NDArray[Any], lidar: str, zero_first_bin: bool = True) -> Tensor:
@@ -18,7 +18,7 @@ def observation_from_scan(scan: NDArray[Any], lidar: str, zero_first_bin: bool =
     Parameters
     ----------
     scan : ndarray of shape (..., 1080) [m]
-        Ranges; ray 0 straight ahead, anticlockwise, 25 where a ray hits nothing.
+        Ranges; ray 0 straight ahead, anticlockwise, 25 where a ray hits nothing, 0 where nobody saw anything.
     lidar : str
         ``"rings"`` or ``"1d"``.
     zero_first_bin : bool
@@ -34,7 +34,7 @@ def observation_from_scan(scan: NDArray[Any], lidar: str, zero_first_bin: bool =
     """
     scan = np.ascontiguousarray(scan, dtype=np.float32)
     if lidar == "1d":
-        return torch.from_numpy(scan_to_1d(scan))
+        return torch.from_numpy(scan_to_1d(fill_blind(scan)))
     return observation_from_rings(scan_to_rings(scan), zero_first_bin)
 
 

@@ -9,6 +9,7 @@ Compiled loops use the kernels of ``navrep_data.observations._rings`` with the t
 from __future__ import annotations
 
 from navrep_data.observations.adapter import Lidar, ScanAdapter
+from navrep_data.observations.blind import BLIND_RANGE, fill_blind
 from navrep_data.observations.rings import RING_EDGES, rings_to_float, rings_to_scan, scan_to_rings
 from navrep_data.observations.scans import (
     metres_from_millimetres,
@@ -18,9 +19,11 @@ from navrep_data.observations.scans import (
 )
 
 __all__ = [
+    "BLIND_RANGE",
     "RING_EDGES",
     "Lidar",
     "ScanAdapter",
+    "fill_blind",
     "metres_from_millimetres",
     "millimetres_from_metres",
     "rings_to_float",

@@ -21,6 +21,9 @@ U8 = NDArray[np.uint8]
 B1 = NDArray[np.bool_]
 
 INVALID, FREE, RETURN = 0, 1, 2
+# What is known of a direction from the robot's centre: nobody looked there; a scanner looked, but something is in
+# between; it is seen as far as the scan reaches.
+BLIND, HIDDEN, SEEN = 0, 1, 2
 TWO_PI = 2.0 * math.pi
 # Neighbouring returns are one surface up to this change of range per distance between the rays: seen at more than
 # about 11 degrees. Beyond, each keeps its own half of the gap between them, at its own range.
@@ -123,10 +126,15 @@ def see_scan(
 @kernel
 def add_scans(
     scans: F64, range_min: float, range_max: float, invalid_is_free: bool, rays: F64, half_step: float, x: float,
-    y: float, closed: bool, beam_of: I64, angle_min: float, increment: float, slack: float, directions: F64,
-    nearest: F64, known: B1,
+    y: float, closed: bool, beam_of: I64, reach: F64, angle_min: float, increment: float, slack: float,
+    directions: F64, nearest: F64, known: U8,
 ) -> None:  # fmt: skip
-    """See a batch of scans of one scanner: lower `nearest` to their returns, set `known` where rays say something."""
+    """See a batch of scans of one scanner: lower `nearest` to their returns, raise `known` to what its rays tell.
+
+    A ray of the model is seen to its end, `reach` from the scanner, only if the beam that looks there gets so far. If
+    it returns from something nearer, the model's ray may have passed beside that: through the parallax between two
+    returns, or into the shadow behind one.
+    """
     state = np.empty(scans.shape[1], np.uint8)
     for b in range(scans.shape[0]):
         classify(scans[b], range_min, range_max, invalid_is_free, state)
@@ -134,5 +142,43 @@ def add_scans(
             scans[b], state, rays, half_step, x, y, closed, angle_min, increment, slack, directions, nearest[b],
         )  # fmt: skip
         for k in range(beam_of.shape[0]):
-            if beam_of[k] >= 0 and state[beam_of[k]] != INVALID:
-                known[b, k] = True
+            if beam_of[k] < 0 or state[beam_of[k]] == INVALID:
+                continue
+            if state[beam_of[k]] == FREE or scans[b, beam_of[k]] >= reach[k]:
+                known[b, k] = SEEN
+            elif known[b, k] == BLIND:
+                known[b, k] = HIDDEN
+
+
+@kernel
+def fill_gaps(ranges: F64, gap: B1, seen: B1, widest: int, closed: bool, farthest: float) -> None:
+    """Give each run of rays in `gap` the smaller of the ranges beside it, as far as those are `seen`.
+
+    Runs of more than `widest` rays get at most `farthest`, as do runs with nothing seen beside them. The last ray is
+    the first one's neighbour if `closed`.
+    """
+    n = ranges.shape[0]
+    start = 0
+    if closed:
+        while start < n and gap[start]:
+            start += 1
+        start %= n  # a whole turn of gap has no beginning
+    k = 0
+    while k < n:
+        if not gap[(start + k) % n]:
+            k += 1
+            continue
+        stop = k
+        while stop < n and gap[(start + stop) % n]:
+            stop += 1
+        near = np.inf
+        before, after = start + k - 1, start + stop
+        if (closed or before >= 0) and seen[before % n]:
+            near = ranges[before % n]
+        if (closed or after < n) and seen[after % n]:
+            near = min(near, ranges[after % n])
+        if stop - k > widest or near == np.inf:
+            near = min(near, farthest)
+        for j in range(k, stop):
+            ranges[(start + j) % n] = near
+        k = stop

@@ -34,10 +34,11 @@ def _write_section(mask, behind, spread, row):
 
 
 @kernel
-def rings_from_mm(scan, cell_of_mm, first_ray, spread, out):
+def rings_from_mm(scan, cell_of_mm, first_ray, spread, unseen, out):
     """Rings of one scan in millimetres.
 
     scan (n_rays,) uint16; cell_of_mm (65536,) uint8; first_ray (65,) int64; spread (256,) uint64, eight cells each;
+    unseen uint64, the cells that are unknown in a section of which nobody saw anything: all or none;
     out (64, 8) uint64, eight cells each, overwritten.
     """
     for section in range(N_SECTIONS):
@@ -50,20 +51,23 @@ def rings_from_mm(scan, cell_of_mm, first_ray, spread, out):
         behind = np.uint64(0)
         if mask != np.uint64(0):
             behind = mask | (~mask + _ONE)
+        elif rays.shape[0] > 0:
+            behind = unseen
         _write_section(mask, behind, spread, out[section])
 
 
 @kernel
-def rings_from_metres(scan, bits, cell_of_bucket, edge_bits, first_ray, spread, out):
+def rings_from_metres(scan, bits, cell_of_bucket, edge_bits, first_ray, spread, unseen, out):
     """Rings of one scan in metres.
 
     scan (n_rays,) float32; bits (n_rays,) uint32 = scan.view(uint32); cell_of_bucket (65536,) uint8;
     edge_bits (64,) uint32, lower edges as bit patterns (+1 past the largest for the last cell);
-    first_ray, spread, out as in `rings_from_mm`.
+    first_ray, spread, unseen, out as in `rings_from_mm`.
     """
     for section in range(N_SECTIONS):
         mask = np.uint64(0)
         behind_all = False
+        seen = first_ray[section] == first_ray[section + 1]  # no ray looks there: the resolution's fault
         for i in range(first_ray[section], first_ray[section + 1]):
             pattern = bits[i]
             cell = np.int64(cell_of_bucket[pattern >> np.uint32(16)])
@@ -73,6 +77,8 @@ def rings_from_metres(scan, bits, cell_of_bucket, edge_bits, first_ray, spread, 
                     behind_all = True  # as in the original: nearer than every cell, but in none
                 elif value > np.float32(0.0) and value < np.float32(1.0):
                     mask |= _ONE  # a denormal
+                elif value == np.float32(np.inf):
+                    seen = True
                 continue  # zero, infinite and NaN mark nothing
             if pattern >= edge_bits[cell]:
                 cell += 1
@@ -82,21 +88,23 @@ def rings_from_metres(scan, bits, cell_of_bucket, edge_bits, first_ray, spread, 
             behind = _ALL
         elif mask != np.uint64(0):
             behind = mask | (~mask + _ONE)
+        elif not seen:
+            behind = unseen
         _write_section(mask, behind, spread, out[section])
 
 
 @kernel
-def rings_from_mm_rows(scans, cell_of_mm, first_ray, spread, out):
+def rings_from_mm_rows(scans, cell_of_mm, first_ray, spread, unseen, out):
     """`rings_from_mm` for scans (N, n_rays), out (N, 64, 8)."""
     for n in range(scans.shape[0]):
-        rings_from_mm(scans[n], cell_of_mm, first_ray, spread, out[n])
+        rings_from_mm(scans[n], cell_of_mm, first_ray, spread, unseen, out[n])
 
 
 @kernel
-def rings_from_metres_rows(scans, bits, cell_of_bucket, edge_bits, first_ray, spread, out):
+def rings_from_metres_rows(scans, bits, cell_of_bucket, edge_bits, first_ray, spread, unseen, out):
     """`rings_from_metres` for scans (N, n_rays), out (N, 64, 8)."""
     for n in range(scans.shape[0]):
-        rings_from_metres(scans[n], bits[n], cell_of_bucket, edge_bits, first_ray, spread, out[n])
+        rings_from_metres(scans[n], bits[n], cell_of_bucket, edge_bits, first_ray, spread, unseen, out[n])
 
 
 @kernel

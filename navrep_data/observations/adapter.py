@@ -10,14 +10,16 @@ become short pieces of surface in the robot's frame; the model's rays are cast a
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from navrep_data.errors import ArrayError, ConfigError
+from navrep_data.errors import ArrayError, BlindSectorWarning, ConfigError
 from navrep_data.observations import _adapter
+from navrep_data.observations.blind import BLIND_RANGE, describe_rays, runs_of
 from navrep_data.schema import SensorContract
 
 POOLINGS = ("nearest", "min")
@@ -25,6 +27,8 @@ POOLINGS = ("nearest", "min")
 LARGEST_INCREMENT = math.radians(30.0)
 # Angles that agree to this are the same [rad]: float32 drivers round.
 SAME_ANGLE = 1e-5
+# More rays than this share that say nothing, though a scanner looks there, are worth a word.
+MANY_INVALID = 0.1
 
 
 @dataclass(frozen=True)
@@ -109,18 +113,31 @@ class ScanAdapter:
         ``"min"``: the nearest surface within half an increment to each side, so that nothing thin is lost when many
         rays become few.
     unknown : float, optional
-        Range of directions that no scanner says anything about [m]: outside every field of view, or invalid. Default:
-        the contract's range_max, which models read as free. 0 marks them as invalid: rings ignore such rays, but a
-        model on ``lidar="1d"`` takes them for something that touches the robot.
+        Range of directions that nobody saw [m]: outside every field of view, or invalid. Default: 0, which rings show
+        as unknown and models that read ranges as something near (:mod:`navrep_data.observations.blind`); the first such
+        scan warns, once per adapter. Giving a number says that this is known, and no warning comes. The contract's
+        range_max calls such directions free: a policy drives there without looking.
+
+    Attributes
+    ----------
+    blind : ndarray of shape (contract.n_rays,), bool
+        Rays that no scanner looks along, whatever it returns.
+
+    Warns
+    -----
+    BlindSectorWarning
+        If there are blind rays, or a tenth of the others say nothing, and `unknown` is not given.
 
     Notes
     -----
     Rules:
 
     * Where several scanners see something in one direction, the nearest counts.
+    * A ray of the model is free only if some scanner sees as far as the model's ray goes. Where a scanner looks there
+      but returns from something nearer, which the ray passes by (a gap of parallax, a shadow), the nearer of the rays
+      beside it counts. So it does between two fields of view, up to the largest increment.
     * Neighbouring returns are joined by a straight line if their ranges are alike (a surface seen at more than about 11
       degrees), otherwise each stands for half the gap at its own range. So few rays become many without stairs.
-    * What the robot's centre would see but no scanner can (behind something, from their places) stays unseen.
     * Surfaces beyond the contract's range_max count as free.
     * A scanner that has the contract's own rays passes through unchanged, but for invalid rays.
     """
@@ -134,14 +151,15 @@ class ScanAdapter:
     ) -> None:
         self.lidars = (lidars,) if isinstance(lidars, Lidar) else tuple(lidars)
         self.contract = SensorContract() if contract is None else contract
-        self.unknown = self.contract.range_max if unknown is None else float(unknown)
+        self.unknown = 0.0 if unknown is None else float(unknown)
+        self._silent = unknown is not None
         if not self.lidars:
             raise ConfigError("lidars is empty, expected at least one Lidar: describe the robot's scanner.")
         if pooling not in POOLINGS:
             raise ConfigError(f"pooling is {pooling!r}, expected 'nearest' or 'min'.")
         if not 0.0 <= self.unknown <= self.contract.range_max:
             raise ConfigError(
-                f"unknown is {unknown} m, expected 0 to {self.contract.range_max:g}: 0 for invalid, range_max for free."
+                f"unknown is {unknown} m, expected 0 to {self.contract.range_max:g}: 0 for not seen, range_max if free."
             )
         self.pooling = pooling
         angles = self.contract.angle_min + np.arange(self.contract.n_rays) * self.contract.angle_increment
@@ -149,7 +167,22 @@ class ScanAdapter:
         self._slack = 0.5 if pooling == "min" else _adapter.ROUNDING
         self._rays = [_ray_table(lidar) for lidar in self.lidars]
         self._beam_of = [_beam_table(lidar, self.contract, self._directions) for lidar in self.lidars]
+        self._reach = [_reach_table(lidar, self.contract, self._directions) for lidar in self.lidars]
+        self._closed = self.contract.covers_full_turn()
+        self.blind, self._bridged = self._blind_rays()
         self._same = len(self.lidars) == 1 and _same_rays(self.lidars[0], self.contract)
+
+    def _blind_rays(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return the rays that no scanner looks along, and those where two fields of view all but meet."""
+        unwatched = np.all([beam < 0 for beam in self._beam_of], axis=0)
+        n = len(unwatched)
+        widest = max(abs(lidar.angle_increment) for lidar in self.lidars) / abs(self.contract.angle_increment)
+        narrow = np.zeros(n, np.bool_)
+        start = int(np.argmin(unwatched)) if self._closed else 0  # no run is cut in two by the beginning of the scan
+        for first, last in runs_of(np.roll(unwatched, -start)):
+            if last - first + 1 <= max(1.0, widest + _adapter.ROUNDING):
+                narrow[(np.arange(first, last + 1) + start) % n] = True
+        return unwatched & ~narrow, narrow
 
     def __call__(self, *scans: ArrayLike) -> NDArray[np.float32]:
         """Turn one scan per lidar into the model's scan.
@@ -172,8 +205,10 @@ class ScanAdapter:
         rows, lead = self._checked(scans)
         shape = (len(rows[0]), self.contract.n_rays)
         nearest = np.full(shape, np.inf)
-        known = np.zeros(shape, np.bool_)
-        for lidar, batch, rays, beam_of in zip(self.lidars, rows, self._rays, self._beam_of, strict=True):
+        known = np.full(shape, _adapter.BLIND, np.uint8)
+        known[:, self._bridged] = _adapter.HIDDEN
+        tables = zip(self.lidars, rows, self._rays, self._beam_of, self._reach, strict=True)
+        for lidar, batch, rays, beam_of, reach in tables:
             if self._same:
                 self._copy(lidar, batch, nearest, known)
                 continue
@@ -181,21 +216,54 @@ class ScanAdapter:
             _adapter.add_scans(
                 np.ascontiguousarray(batch[:, :: int(flipped)]), lidar.range_min, lidar.range_max,
                 lidar.invalid_is_free, rays, 0.5 * abs(lidar.angle_increment), lidar.x, lidar.y, lidar.closed,
-                beam_of, self.contract.angle_min, self.contract.angle_increment, self._slack, self._directions,
+                beam_of, reach, self.contract.angle_min, self.contract.angle_increment, self._slack, self._directions,
                 nearest, known,
             )  # fmt: skip
-        seen = np.minimum(nearest, self.contract.range_max)
-        seen[np.isinf(nearest) & ~known] = self.unknown
-        scan: NDArray[np.float32] = seen.astype(np.float32).reshape(*lead, self.contract.n_rays)
-        return scan
+        scan: NDArray[np.float32] = self._finish(nearest, known).astype(np.float32)
+        return scan.reshape(*lead, self.contract.n_rays)
+
+    def _finish(self, nearest: NDArray[np.float64], known: NDArray[np.uint8]) -> NDArray[np.float64]:
+        """Return ranges of all rays: what was hit, what is free, what is behind something, what nobody saw."""
+        ranges = np.minimum(nearest, self.contract.range_max)
+        missed = np.isinf(nearest)
+        hidden = missed & (known == _adapter.HIDDEN)
+        blind = missed & (known == _adapter.BLIND)
+        for k in np.flatnonzero(hidden.any(axis=1)).tolist():
+            seen = ~(hidden[k] | blind[k])
+            _adapter.fill_gaps(ranges[k], hidden[k], seen, len(seen), self._closed, self.unknown)
+        ranges[blind] = self.unknown
+        if not self._silent and blind.any():
+            self._warn(blind)
+        return ranges
+
+    def _warn(self, blind: NDArray[np.bool_]) -> None:
+        """Say once that models are shown something in place of what nobody saw."""
+        contract, watched = self.contract, int((~self.blind).sum())
+        lost = int((blind & ~self.blind).sum(axis=1).max())
+        shown = (
+            f"they are 0 in its scans, unknown in rings, at most {BLIND_RANGE:g} m for networks that read ranges. Give "
+            "ScanAdapter(unknown=0) if that is meant, unknown=range_max if they are free"
+        )
+        if self.blind.any():
+            where = describe_rays(self.blind, contract.angle_min, contract.angle_increment)
+            said = f"No scanner looks along {int(self.blind.sum())} of {contract.n_rays} rays ({where}): {shown}."
+        elif lost > MANY_INVALID * watched:
+            said = (
+                f"{lost} of {contract.n_rays} rays say nothing (NaN, 0, below range_min): {shown}, or "
+                "Lidar(invalid_is_free=True) if the driver reports no return so."
+            )
+        else:
+            return
+        self._silent = True
+        warnings.warn(said, BlindSectorWarning, stacklevel=4)
 
     def _copy(
-        self, lidar: Lidar, batch: NDArray[np.float64], nearest: NDArray[np.float64], known: NDArray[np.bool_]
+        self, lidar: Lidar, batch: NDArray[np.float64], nearest: NDArray[np.float64], known: NDArray[np.uint8]
     ) -> None:
         """Take over a scan that has the contract's rays already."""
         with np.errstate(invalid="ignore"):
             hit = (batch >= lidar.range_min) & (batch > 0.0) & (batch < lidar.range_max)
-            known |= hit | (batch >= lidar.range_max) | lidar.invalid_is_free
+            known[hit | (batch >= lidar.range_max) | lidar.invalid_is_free] = _adapter.SEEN
         nearest[hit] = batch[hit]
 
     def _checked(self, scans: tuple[ArrayLike, ...]) -> tuple[list[NDArray[np.float64]], tuple[int, ...]]:
@@ -242,6 +310,14 @@ def _beam_table(lidar: Lidar, contract: SensorContract, directions: NDArray[np.f
     beam: NDArray[np.int64] = np.rint((past + 0.5) % turn - 0.5).astype(np.int64)
     beam[beam >= lidar.n_rays] = 0 if lidar.closed else -1
     return beam
+
+
+def _reach_table(lidar: Lidar, contract: SensorContract, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far from the lidar each ray of the contract ends [m]."""
+    ends = contract.range_max * directions
+    # float32 ranges of what stands exactly at the end still reach it
+    reach: NDArray[np.float64] = np.hypot(ends[0] - lidar.x, ends[1] - lidar.y) * (1.0 - 1e-6)
+    return reach
 
 
 def _same_rays(lidar: Lidar, contract: SensorContract) -> bool:

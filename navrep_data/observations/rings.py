@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from navrep_data import schema
-from navrep_data.errors import ArrayError
+from navrep_data.errors import ArrayError, ConfigError
 from navrep_data.observations import _rings
 
 N_SECTIONS, N_CELLS = schema.RINGS_SHAPE
@@ -24,6 +24,8 @@ _POWER = 3.12
 _LEAST_DEPTH = 0.01
 # A decoded cell counts as a return or the space behind one from this value of {0, 1, 2} upwards.
 _OCCUPIED_FROM = np.float32(0.4)
+# Cells of a section of which nobody saw anything that are unknown, as bits.
+_BLIND = {"unknown": np.uint64(0xFFFFFFFFFFFFFFFF), "free": np.uint64(0)}
 
 
 def _make_edges() -> NDArray[np.float32]:
@@ -116,7 +118,9 @@ def _checked_out(out: NDArray[np.uint8] | None, shape: tuple[int, ...]) -> NDArr
     return out
 
 
-def scan_to_rings(scan: ArrayLike, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+def scan_to_rings(
+    scan: ArrayLike, out: NDArray[np.uint8] | None = None, *, blind: str = "unknown"
+) -> NDArray[np.uint8]:
     """Turn scans into rings.
 
     Parameters
@@ -126,22 +130,29 @@ def scan_to_rings(scan: ArrayLike, out: NDArray[np.uint8] | None = None) -> NDAr
         float64 is rounded to float32 first.
     out : ndarray of shape (..., 64, 64), uint8, optional
         Where to write the result; C-contiguous.
+    blind : {"unknown", "free"}
+        What a section is of which nobody saw anything (all its rays 0 or NaN). ``"free"``: as in the original.
 
     Returns
     -------
     ndarray of shape (..., 64, 64), uint8
-        Angle by range: 0 free, 1 unknown (behind a return), 2 occupied. This is `out` where it was given.
+        Angle by range: 0 free, 1 unknown (behind a return, or not seen), 2 occupied. This is `out` where it was given.
 
     Raises
     ------
     ArrayError
         If `scan` has another dtype or no ray axis, or `out` does not fit.
+    ConfigError
+        If `blind` is neither.
 
     Notes
     -----
     Original: ``crings.pyx``, matched exactly, negative ranges included (they make their whole section
-    unknown). A uint16 scan gives the rings of ``float32(k) / float32(1000)``.
+    unknown), but for sections of which nobody saw anything: there they are free, which ``blind="free"`` gives. The
+    simulators' scans have none. A uint16 scan gives the rings of ``float32(k) / float32(1000)``.
     """
+    if blind not in _BLIND:
+        raise ConfigError(f"blind is {blind!r}, expected 'unknown' or 'free'.")
     array = np.asarray(scan)
     if array.dtype == np.float64:
         array = array.astype(np.float32)
@@ -157,11 +168,11 @@ def scan_to_rings(scan: ArrayLike, out: NDArray[np.uint8] | None = None) -> NDAr
     rows = np.ascontiguousarray(array).reshape(n_scans, n_rays)
     target = rings.reshape(n_scans, N_SECTIONS, N_CELLS).view(np.uint64)  # eight cells at a time
     if array.dtype == np.uint16:
-        _rings.rings_from_mm_rows(rows, cell_of_millimetre(), first_rays(n_rays), byte_spread(), target)
+        _rings.rings_from_mm_rows(rows, cell_of_millimetre(), first_rays(n_rays), byte_spread(), _BLIND[blind], target)
     else:
         cells, next_edge = float_tables()
         _rings.rings_from_metres_rows(
-            rows, rows.view(np.uint32), cells, next_edge, first_rays(n_rays), byte_spread(), target
+            rows, rows.view(np.uint32), cells, next_edge, first_rays(n_rays), byte_spread(), _BLIND[blind], target
         )
     return rings
 

@@ -43,7 +43,8 @@ def scan_to_1d(scan: ArrayLike, range_max: float = schema.RANGE_MAX, clip: bool 
 
     Notes
     -----
-    Original: ``navrep/tools/wdataset.py`` divides by 25 and does not clip; its VAE1D trainer clips.
+    Original: ``navrep/tools/wdataset.py`` divides by 25 and does not clip; its VAE1D trainer clips. Rays that nobody
+    saw (0) stay 0, which a model would take for something that touches the robot: :func:`fill_blind` comes first.
     """
     _check_range_max(range_max)
     array = np.asarray(scan)

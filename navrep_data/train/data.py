@@ -105,7 +105,7 @@ def open_dataset(
     preload = _fits(root, recipe) if preload is None else preload
     lidar: Any = recipe.lidar
     people = ["humans"] if has_people(root, recipe) else []
-    common: dict[str, Any] = {"split": split, "scan_unit": "normalized", "invalid": "range_max", "preload": preload}
+    common: dict[str, Any] = {"split": split, "scan_unit": "normalized", "invalid": "near", "preload": preload}
     if recipe.model == "v":
         return ScanDataset(root, lidar, fields=people, **common)
     fields = ["robot_state", "action", "goal_valid", *people]

@@ -99,7 +99,7 @@ def _of_policies(trained: Policy, stored: Policy, data: Path, storage: str) -> R
 
 def _rows(data: Path) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """Return scans (N, 8, 1080) [m] and robot states (N, 8, 5), evenly spread over the test split."""
-    dataset = SequenceDataset(data, "1d", window=_WINDOW, split="test", fields=["robot_state"], invalid="range_max")
+    dataset = SequenceDataset(data, "1d", window=_WINDOW, split="test", fields=["robot_state"], invalid="near")
     whole = np.flatnonzero(dataset.table.count == _WINDOW)
     if len(whole) == 0:
         raise ConfigError(f"{data} has no episode of {_WINDOW} rows in its test split, expected a larger dataset.")

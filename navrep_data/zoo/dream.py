@@ -107,7 +107,7 @@ class DreamEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         # windows of exactly these rows; shorter ones at the ends of episodes are passed over
         self._starts = SequenceDataset(
             Path(data), lidar, window=real_rows, split=split, fields=["robot_state", "action", "goal_valid"],
-            scan_unit="normalized", invalid="range_max",
+            scan_unit="normalized", invalid="near",
         )  # fmt: skip
         self._whole = np.flatnonzero(self._starts.table.count == real_rows)
         if len(self._whole) == 0:

@@ -18,6 +18,7 @@ from navrep_data.models.noise import Noise
 from navrep_data.models.observation import observation_from_scan
 from navrep_data.models.vae import VAE
 from navrep_data.models.world_model import Stream, WorldModel
+from navrep_data.observations import fill_blind
 from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, SensorContract
 
 INFERENCE = ("deterministic", "as_released")
@@ -319,7 +320,7 @@ class Policy:
             return state.cpu().numpy(), state.cpu().numpy()
         obs = observation_from_scan(ranges, self.lidar, self.features is not None).to(self.device)
         if self.features is None:
-            front = torch.tensor(ranges, device=self.device) if self.lidar == "1d" else obs.flatten(1)
+            front = torch.tensor(fill_blind(ranges), device=self.device) if self.lidar == "1d" else obs.flatten(1)
         else:
             assert self._encoder is not None
             front = self._encoder(obs)
@@ -352,7 +353,7 @@ class Policy:
         assert self.lidar is not None
         if self.features is None:
             if self.lidar == "1d":
-                obs = torch.tensor(ranges)
+                obs = torch.tensor(fill_blind(ranges))
             else:
                 obs = observation_from_scan(ranges, "rings", zero_first_bin=False).flatten(1)
             obs = obs.to(self.device)

@@ -15,7 +15,7 @@ from torch.utils.data import BatchSampler, DataLoader, RandomSampler
 
 from navrep_data.datasets import ScanDataset, SequenceDataset
 from navrep_data.errors import ConfigError, DatasetNotFoundError, UnknownNameError
-from navrep_data.observations import rings_to_float, scan_to_rings
+from navrep_data.observations import fill_blind, rings_to_float, scan_to_rings
 
 # The tests ask for four workers wherever they run.
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning")
@@ -110,6 +110,8 @@ def test_scan_units_and_invalid_rays(tmp_path, scan_dtype):
         ("metres", "range_max"): np.where(metres == 0, np.float32(25), metres),
         ("normalized", "zero"): metres / np.float32(25),
         ("normalized", "range_max"): np.where(metres == 0, np.float32(1), metres / np.float32(25)),
+        ("metres", "near"): fill_blind(metres),
+        ("normalized", "near"): fill_blind(metres) / np.float32(25),
     }
     for (unit, invalid), expected in cases.items():
         got = SequenceDataset(tmp_path / "d", "1d", window=12, scan_unit=unit, invalid=invalid)[0]["scan"]

@@ -36,7 +36,8 @@ def rebuilt(sound, out, change, **settings):
             worlds = change(k, columns, worlds) or worlds
             names = [name for name in old.columns if name in columns]
             writer = ShardWriter(
-                env=old.env, config=old.config, seed=old.seed, sensor=settings.get("sensor", old.sensor),
+                env=old.env, config=settings.get("config", old.config), seed=old.seed,
+                sensor=settings.get("sensor", old.sensor),
                 scan_dtype=old.scan_dtype, columns=names, max_humans=old.max_humans, length=LENGTH, first_sequence=k,
             )  # fmt: skip
             writer.append(columns, worlds)
@@ -117,6 +118,17 @@ def test_frozen_and_dead_lidars(sound, tmp_path):
     assert [(check, what) for check, _, what in found] == [
         ("sensor", "20 of 1080 rays are invalid (0) on every row")
     ] * 3
+
+
+@pytest.mark.parametrize(("declared", "left"), [([[100, 119]], None), ([[90, 109], [3, 4]], 10), ("rubbish", 20)])
+def test_sectors_that_are_declared_blind(sound, tmp_path, declared, left):
+    def kill(k, columns, worlds):
+        columns["scan"][:, 100:120] = 0
+        columns["rings"][:] = scan_to_rings(columns["scan"])
+
+    root = rebuilt(sound, tmp_path / "d", kill, config={"blind_rays": declared})
+    found = [what for check, _, what in problems(root) if check == "sensor"]
+    assert [what.split(" rays")[0] for what in found] == ([] if left is None else [f"{left} of 1080"] * 3)
 
 
 def test_a_sensor_that_cannot_be(sound, tmp_path):

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from navrep_data.errors import ArrayError, ConfigError
-from navrep_data.observations import Lidar, ScanAdapter
+from navrep_data.errors import ArrayError, BlindSectorWarning, ConfigError
+from navrep_data.observations import BLIND_RANGE, Lidar, ScanAdapter, fill_blind, scan_to_rings
 from navrep_data.schema import SensorContract
 from navrep_data.sim.lidar import scan_polygons
 
@@ -97,7 +97,7 @@ def test_clockwise_and_upside_down(seed):
     down = Lidar(900, 2.0, -4.0 / 899, x=x, y=y, yaw=yaw)
     ranges = seen_by(up, FURNITURE, LEGS)
     assert np.array_equal(seen_by(down, FURNITURE, LEGS), ranges[::-1])
-    assert np.array_equal(ScanAdapter(down)(ranges[::-1]), ScanAdapter(up)(ranges))
+    assert np.array_equal(ScanAdapter(down, unknown=0)(ranges[::-1]), ScanAdapter(up, unknown=0)(ranges))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -111,9 +111,11 @@ def test_two_scanners_on_corners_make_one_scan(seed):
     off = np.abs(out - true)
     assert np.median(off) < 1e-4
     assert (off > 0.05).mean() < 0.06, "only around edges that scanner and centre see from different sides"
-    # one scanner alone is blind to the back: free by default
-    alone = ScanAdapter(front)(seen_by(front, FURNITURE, LEGS, pose))
-    assert (alone == CONTRACT.range_max).sum() > 150
+    assert not adapter.blind.any()
+    # one scanner alone is blind to the back, which is not free by default
+    with pytest.warns(BlindSectorWarning, match=r"No scanner looks along \d+ of 1080 rays \(\d+ to \d+ deg\)"):
+        alone = ScanAdapter(front)(seen_by(front, FURNITURE, LEGS, pose))
+    assert (alone == 0.0).sum() > 150
     # nothing is invented nearer than it is
     assert (out > true - 0.05).mean() > 0.97
 
@@ -131,7 +133,7 @@ def test_field_of_view_and_the_unknown_directions():
     angles = CONTRACT.angle_min + np.arange(1080) * CONTRACT.angle_increment
     behind = np.cos(angles) < -0.01
     front = np.cos(angles) > 0.01
-    free = ScanAdapter(lidar)(ranges)
+    free = ScanAdapter(lidar, unknown=25.0)(ranges)
     assert (free[behind] == 25.0).all()
     assert np.abs(free - truth())[front].max() < 0.1
     invalid = ScanAdapter(lidar, unknown=0.0)(ranges)
@@ -168,8 +170,75 @@ def test_no_return_is_free_not_unknown(none):
 def test_all_invalid_is_all_unknown():
     lidars = [corner(0.2, 0.2, 0.8), corner(-0.2, -0.2, -2.3)]
     scans = np.full((2, 1081), np.nan)
-    assert (ScanAdapter(lidars)(*scans) == 25.0).all()
-    assert (ScanAdapter(lidars, unknown=0.0)(*scans) == 0.0).all()
+    assert (ScanAdapter(lidars, unknown=25.0)(*scans) == 25.0).all()
+    with pytest.warns(BlindSectorWarning, match=r"1080 of 1080 rays say nothing .*invalid_is_free=True"):
+        assert (ScanAdapter(lidars)(*scans) == 0.0).all()
+
+
+def test_blind_sectors_are_warned_of_once():
+    adapter = ScanAdapter(Lidar(541, -math.pi / 2, math.pi / 540))
+    with pytest.warns(BlindSectorWarning):
+        scan = adapter(np.full(541, 4.0))
+    assert np.array_equal(adapter(np.full(541, 4.0)), scan), "a second warning would fail here"
+    assert (scan[adapter.blind] == 0.0).all()
+    assert adapter.blind.sum() == 539
+    lost = ScanAdapter(Lidar.of(CONTRACT))
+    ranges = np.full(1080, 4.0)
+    ranges[:100] = np.nan
+    lost(ranges)  # a few are every scanner's
+    ranges[:200] = np.nan
+    with pytest.warns(BlindSectorWarning, match="200 of 1080 rays say nothing"):
+        lost(ranges)
+    lost(ranges)
+
+
+def test_what_models_are_shown_of_a_blind_sector():
+    """Rings: unknown. Ranges: the nearer side of a narrow gap; of a wide one that, but no more than a metre."""
+    scan = np.full(1080, 6.0, np.float32)
+    scan[:100], scan[300:317], scan[500:518], scan[800:900] = 0.0, 0.0, 0.0, 0.0
+    scan[299], scan[900:] = 3.0, 0.5
+    shown = fill_blind(scan)
+    assert shown.dtype == np.float32
+    assert (shown[:100] == 0.5).all()
+    assert (shown[300:317] == 3.0).all()
+    assert (shown[500:518] == BLIND_RANGE).all()
+    assert (shown[800:900] == 0.5).all()
+    assert np.array_equal(shown[scan > 0], scan[scan > 0])
+    assert (fill_blind(np.zeros((2, 1080))) == BLIND_RANGE).all()
+    assert fill_blind(shown) is shown
+    rings = scan_to_rings(scan)
+    assert (rings[1:5] == 1).all()
+    with pytest.raises(ArrayError, match="use metres_from_millimetres"):
+        fill_blind(np.zeros(1080, np.uint16))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_walls_that_scanners_see_have_no_holes(seed):
+    """In a closed room nothing is free as far as the scan reaches, whatever lies between the returns of the corners."""
+    r = np.random.default_rng(seed)
+    front, rear = corner(0.35, 0.3, math.pi / 4, 271), corner(-0.35, -0.3, -3 * math.pi / 4, 271)
+    adapter = ScanAdapter([front, rear])
+    for _ in range(10):
+        pose = (*r.uniform(-1.0, 1.0, 2), r.uniform(-3, 3))
+        out = adapter(*(seen_by(s, FURNITURE, LEGS, pose) for s in (front, rear)))
+        assert out.max() < 13.0
+        assert out.min() > 0.0
+
+
+def test_between_two_fields_of_view():
+    """They all but meet, half an increment apart: the nearer side counts. A gap of more is blind."""
+    step = math.pi / 180
+    halves = [Lidar(180, 0.0, step, range_max=30.0), Lidar(180, math.pi, step, range_max=30.0, x=0.0)]
+    out = ScanAdapter(halves)(np.full(180, 4.0), np.full(180, 6.0))
+    assert set(np.round(np.unique(out))) <= {4.0, 5.0, 6.0}
+    apart = [Lidar(178, 0.0, step), Lidar(178, math.pi, step)]
+    adapter = ScanAdapter(apart, unknown=0)
+    assert 0 < adapter.blind.sum() < 16
+    assert (adapter(np.full(178, 4.0), np.full(178, 6.0))[adapter.blind] == 0.0).all()
+    # one target ray between them that no beam is nearest to
+    thin = [Lidar(180, 0.4 * step, step), Lidar(179, math.pi + 0.9 * step, step)]
+    out = ScanAdapter(thin)(np.full(180, 4.0), np.full(179, np.inf))
+    assert out.min() > 3.9
 
 
 def test_min_pooling_loses_nothing_thin():

@@ -7,7 +7,7 @@ import pytest
 from numba import config
 
 from navrep_data import observations as obs
-from navrep_data.errors import ArrayError
+from navrep_data.errors import ArrayError, ConfigError
 from navrep_data.observations.rings import first_rays
 
 GOLDEN = Path(__file__).resolve().parents[2].parent / "shared" / "golden" / "rings.npz"
@@ -23,11 +23,14 @@ def golden():
 
 
 def slow_rings(scan):
-    """Rings from the definition: a cell is occupied if a ray ends in it, unknown if a ray ends before it."""
+    """Rings from the definition: a cell is occupied if a ray ends in it, unknown if one ends before it or none sees."""
     edges, n = obs.RING_EDGES, len(scan)
     rings = np.zeros((64, 64), np.uint8)
     for section in range(64):
         rays = [scan[i] for i in range(n) if -(-section * n // 64) <= i < -(-(section + 1) * n // 64)]
+        if rays and all(d == 0 or np.isnan(d) for d in rays):
+            rings[section] = 1
+            continue
         rays = [d for d in rays if d != 0]
         for cell in range(64):
             if any(edges[cell] <= d < edges[cell + 1] for d in rays):
@@ -45,7 +48,28 @@ def test_edges_are_the_originals(golden):
 
 @pytest.mark.parametrize("name", ["", "edge_", "rays1080_", "rays720_", "rays360_", "rays64_"])
 def test_rings_are_the_originals(golden, name):
-    np.testing.assert_array_equal(obs.scan_to_rings(golden[f"{name}scans"]), golden[f"{name}rings_raw"][..., 0])
+    rings = obs.scan_to_rings(golden[f"{name}scans"], blind="free")
+    np.testing.assert_array_equal(rings, golden[f"{name}rings_raw"][..., 0])
+    if name != "edge_":
+        np.testing.assert_array_equal(obs.scan_to_rings(golden[f"{name}scans"]), rings)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.uint16])
+def test_sections_that_nobody_saw_are_unknown(dtype):
+    scan = np.full(1080, 5000 if dtype == np.uint16 else 5.0, dtype)
+    scan[17:34], scan[40:50] = 0, 0  # all rays of section 1, some of section 2
+    rings = obs.scan_to_rings(scan)
+    assert (rings[1] == 1).all()
+    np.testing.assert_array_equal(rings[2], rings[0])
+    assert (obs.scan_to_rings(scan, blind="free")[1] == 0).all()
+    if dtype == np.float32:
+        scan[17:34] = np.nan
+        np.testing.assert_array_equal(obs.scan_to_rings(scan), rings)
+        scan[20] = np.inf  # one ray saw that there is nothing
+        assert (obs.scan_to_rings(scan)[1] == 0).all()
+    assert (obs.scan_to_rings(scan[:16])[20:24] != 1).any(), "sections without rays are none that nobody saw"
+    with pytest.raises(ConfigError, match="blind is 'wall', expected 'unknown' or 'free'"):
+        obs.scan_to_rings(scan, blind="wall")
 
 
 @pytest.mark.parametrize(

@@ -176,19 +176,19 @@ def test_the_simulator_scans_with_any_sensor(name, rendering):
 
 @pytest.mark.parametrize("name", ["180 degrees", "240 degrees"])
 def test_a_narrow_scan_becomes_one_of_1080_rays(name):
-    """Through ScanAdapter: what a robot with the full sensor would see, where this one looks; free elsewhere."""
+    """Through ScanAdapter: what a robot with the full sensor would see, where this one looks; 0 elsewhere."""
     sensor = dataclasses.replace(SENSORS[name], range_max=25.0)
     narrow, full = (
         Simulator(make_config("soadrl", sensor=s, rendering="trunk"), seed=5) for s in (sensor, SensorContract())
     )
-    adapted = ScanAdapter(Lidar.of(sensor))(narrow.observe()[0])[0]
+    adapted = ScanAdapter(Lidar.of(sensor), unknown=0.0)(narrow.observe()[0])[0]
     expected = full.observe()[0][0]
     angles = np.angle(np.exp(1j * angles_of(SensorContract())))
     seen = np.abs(angles) <= -sensor.angle_min
     close = np.abs(adapted - expected) < 0.1
     assert close[seen].mean() > 0.9, "but at the edges of things"
     unseen = np.abs(angles) > -sensor.angle_min + sensor.angle_increment
-    assert (adapted[unseen] == 25.0).all()
+    assert (adapted[unseen] == 0.0).all()
     assert unseen.mean() > 0.3
 
 
