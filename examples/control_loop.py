@@ -19,7 +19,7 @@ from navrep_data.sim.lidar import scan_polygons
 
 PERIOD = 0.2  # the policies were trained at 5 Hz
 RADIUS = 0.3
-SPEED = 0.8  # of this robot, at most [m/s]; policies ask for up to 1
+SPEED = 0.8  # of this robot, at most [m/s]
 RAYS, INCREMENT = 811, np.radians(270) / 810
 
 
@@ -80,13 +80,14 @@ class Robot:
 def control(robot, policy, max_steps=300, sleep=False):
     """Run the loop until the goal, a collision or the last step; returns which, and the number of steps."""
     adapter = ScanAdapter(robot.scanners, policy.sensor)
+    policy = policy.for_robot(max_speed=SPEED, radius=RADIUS)  # trained on a faster and wider one
     policy.reset(batch_size=1)
     for step in range(max_steps):
         start = time.perf_counter()
         scan = adapter(*robot.scans())
         action = policy.act(scan[None], robot.robot_state()[None])[0]
-        executed = robot.drive(action)
-        policy.observe(executed[None])  # not what was asked for: this robot is slower
+        executed = robot.drive(SPEED * action)
+        policy.observe(executed[None])  # not what was asked for: this robot's diagonal is no faster
         robot.wait()
         if np.hypot(*(robot.goal - robot.pose[:2])) < RADIUS:
             return "goal", step + 1

@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
+
+from navrep_data.errors import ConfigError
 
 FORMAT_NAME = "navrep-data"
 FORMAT_VERSION = 1
@@ -90,6 +93,38 @@ class SensorContract:
         return abs(self.n_rays * self.angle_increment - 2.0 * math.pi) < 2.0 * self.angle_increment
 
 
+# SIM_FACTS a.3: the training environment draws the robot's radius from 0.3 to 0.5 m for every episode, and its full
+# action is 1 m/s along each axis
+TRAINING_SPEED, TRAINING_RADIUS = 1.0, 0.4
+
+
+@dataclass(frozen=True)
+class RobotContract:
+    """What a policy takes for granted of the robot that it drives.
+
+    Attributes
+    ----------
+    max_speed : float
+        Velocity along x and y that an action of 1 stands for [m/s].
+    radius : float
+        Radius of the footprint [m]; where it is drawn for every episode (0.3 to 0.5 m in worlds of polygons), the mean.
+    """
+
+    max_speed: float = TRAINING_SPEED
+    radius: float = TRAINING_RADIUS
+
+    def __post_init__(self) -> None:
+        """Check both."""
+        for name, value, most in (("max_speed", self.max_speed, 100.0), ("radius", self.radius, 10.0)):
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= most:
+                unit = "m/s" if name == "max_speed" else "m"
+                raise ConfigError(f"A robot's {name} is {value!r}, expected more than 0 and at most {most:g} {unit}.")
+
+    def to_dict(self) -> dict[str, float]:
+        """Return the fields as plain JSON values."""
+        return {"max_speed": float(self.max_speed), "radius": float(self.radius)}
+
+
 @dataclass(frozen=True)
 class Column:
     """One column of a shard.
@@ -150,3 +185,17 @@ COLUMNS: dict[str, Column] = {
         Column("source_robot_state", (ROBOT_STATE_SIZE,), "float64", "m, m, m/s, m/s, rad/s", "robot_state with the source's precision, so that imports export unchanged", may_be_nan=True, optional=True),
     )
 }  # fmt: skip
+
+
+def fed_as(settings: Mapping[str, Any]) -> str:
+    """Return in words how a network was fed where that is not the default, from the settings in a results file."""
+    if settings.get("ranges") == "as_released":
+        return "ranges as the authors fed them"  # their software scales nothing
+    return "as trained" if settings.get("scaling") == "none" else ""
+
+
+def result_name(name: str, settings: Mapping[str, Any]) -> str:
+    """Return what results are called: the policy's name, and how it ran where that is not the default."""
+    noise = "as released" if settings.get("inference") == "as_released" else ""
+    how = ", ".join(word for word in (noise, fed_as(settings)) if word)
+    return f"{name} ({how})" if how else name

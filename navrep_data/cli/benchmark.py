@@ -39,6 +39,16 @@ def benchmark_command(
         str,
         typer.Option("--inference", help="deterministic, or as_released (memories with the noise of their training)."),
     ] = "deterministic",
+    ranges: Annotated[
+        str,
+        typer.Option("--ranges", help="contract (cut as in training), or as_released (released networks, uncut)."),
+    ] = "contract",
+    scaling: Annotated[
+        str | None,
+        typer.Option(
+            "--scaling", help="robot (networks in proportion to the robot) or none (as trained).", show_default="robot"
+        ),
+    ] = None,
     source: Annotated[
         str | None,
         typer.Option("--from", metavar="DIR", help="Folder with the authors' files (or https://, hf://user/name)."),
@@ -91,6 +101,8 @@ def benchmark_command(
                 executor=executor,
                 address=address,
                 progress=bars,
+                ranges=ranges,
+                scaling=scaling,
             )
     if as_json:
         print_json(report.to_dict())

@@ -14,7 +14,7 @@ from navrep_data._ray import RayCluster
 from navrep_data.errors import ConfigError, DatasetNotFoundError
 from navrep_data.evaluate import tables
 from navrep_data.evaluate.executors import Job, run, run_on_ray
-from navrep_data.evaluate.policies import PilotSpec, resolve_policy
+from navrep_data.evaluate.policies import NETWORKS, PilotSpec, resolve_policy
 from navrep_data.evaluate.results import Results, file_name, header_of, open_results
 from navrep_data.evaluate.runner import Episode
 from navrep_data.evaluate.scores import by_variant, summary
@@ -26,8 +26,6 @@ PHYSICS = ("original", "consistent")
 SAVE_SECONDS = 2.0
 """The results file is written this often at most while episodes finish."""
 MAX_WORKERS = 1024
-NETWORKS = ("zoo", "folder")
-"""Kinds of policies for which `inference` means something."""
 
 Progress = Callable[[str, int, int], None]
 """Called with a policy's name, how many of its episodes are finished, and of how many."""
@@ -86,6 +84,8 @@ def benchmark(
     executor: str = "local",
     address: str | None = None,
     progress: Progress | None = None,
+    ranges: str = "contract",
+    scaling: str | None = None,
 ) -> Benchmark:
     """Play policies in a suite; the same call goes on after an interruption, or with more episodes.
 
@@ -120,6 +120,13 @@ def benchmark(
         The Ray cluster's ``host:port``, or ``auto``; by default ``RAY_ADDRESS``, or a cluster on this machine alone.
     progress : callable, optional
         Called with a policy's name, how many of its episodes are finished, and of how many.
+    ranges : str
+        ``"contract"``: networks get ranges cut where those of their training were (25 m). ``"as_released"``, for
+        released networks only: uncut, as the authors' software feeds them (up to 109 m on the office map).
+    scaling : str, optional
+        ``"robot"``, the default: where the robot is slower or smaller than that of its training, a network sees and
+        moves in proportion, see :meth:`navrep_data.zoo.policy.Policy.for_robot`. ``"none"``: as trained, and the
+        default for ranges as released.
 
     Returns
     -------
@@ -143,7 +150,10 @@ def benchmark(
         raise ConfigError(f"address is {address}, which only Ray needs; expected executor ray with it.")
     total = chosen.total(episodes)
     specs = list(
-        {s.name: s for s in (resolve_policy(p, source, inference, bool(chosen.maps)) for p in policies)}.values()
+        {
+            s.name: s
+            for s in (resolve_policy(p, source, inference, bool(chosen.maps), ranges, scaling) for p in policies)
+        }.values()
     )
     specs = [s if s.kind in NETWORKS else _plain(s) for s in specs]
     everybody = specs if any(s.name == "goal" for s in specs) else [resolve_policy("goal"), *specs]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from navrep_data.evaluate._on_maps import guided_robots, start_gaps
-from navrep_data.sim import SimConfig, Simulator, scale_actions
+from navrep_data.sim import SimConfig, Simulator, robot_contract, scale_actions
 from navrep_data.sim import _layout as lay
 from navrep_data.sim._fast_marching import UPWIND_FINAL, march
 from navrep_data.sim.map_tables import RADIUS
@@ -43,6 +43,7 @@ class ScenarioWorlds:
     def __init__(self, config: SimConfig, n: int) -> None:
         self.n = n
         self.sensor = config.sensor
+        self.robot = robot_contract(config)
         self.simulator = Simulator(config, n)
         self._config = config
         self._names = config.scenarios
@@ -62,10 +63,14 @@ class ScenarioWorlds:
 
     def step(self, actions: F64) -> NDArray[np.uint8]:
         """Execute actions as shares of the largest velocity."""
-        events = self.simulator.step(scale_actions(self._config, actions))[1]
+        events = self.simulator.step(self.commands(actions))[1]
         self._gaps[0] = self._state.agents[:, 0, lay.A_CLEAR_HUMAN]
         self._gaps[1] = self._state.agents[:, 0, lay.A_CLEAR_STATIC]
         return events
+
+    def commands(self, actions: F64) -> F64:
+        """Return body velocities (W, 3) of actions: a translation longer than 1 is shortened to 1."""
+        return scale_actions(self._config, actions)
 
     def scans(self) -> F32:
         """Return scans (W, n_rays) [m]."""
@@ -112,7 +117,7 @@ class ScenarioWorlds:
 
     def speed(self) -> float:
         """Return the velocity that an action of 1 stands for [m/s]."""
-        return float(self._config.max_velocity[0])
+        return self.robot.max_speed
 
 
 @cache

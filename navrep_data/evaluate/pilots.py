@@ -6,7 +6,6 @@ import hashlib
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -60,6 +59,10 @@ class Pilot(ABC):
     def act(self, worlds: Worlds) -> F64:
         """Return the actions of all worlds (W, 3), in [-1, 1] where they are not to be clipped."""
 
+    def observe(self, executed: F64) -> None:
+        """Hear what the robots were sent for the last actions: body velocities (W, 3) [m/s, m/s, rad/s]."""
+        return
+
 
 class FunctionPilot(Pilot):
     """A callable ``policy(scan, robot_state) -> action`` over 64 rows; rows beyond the worlds' are copies of the first.
@@ -70,7 +73,8 @@ class FunctionPilot(Pilot):
         As in results.
     function : callable
         Takes scans (64, 1080) [m] and robot states (64, 5), returns (64, 2) or (64, 3) in [-1, 1]. If it has a method
-        ``reset`` that is called as ``reset(batch_size=64)`` at first and ``reset(mask=...)`` where episodes begin.
+        ``reset`` that is called as ``reset(batch_size=64)`` at first and ``reset(mask=...)`` where episodes begin; a
+        method ``observe`` is called with (64, 3) after every step: what the robots were sent [m/s, m/s, rad/s].
     """
 
     sees = "scan"
@@ -81,6 +85,7 @@ class FunctionPilot(Pilot):
         self.name = name
         self._function = function
         self._reset: Callable[..., Any] | None = getattr(function, "reset", None)
+        self._observe: Callable[[Any], Any] | None = getattr(function, "observe", None)
         self._started = False
 
     def start(self, worlds: Worlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
@@ -108,6 +113,11 @@ class FunctionPilot(Pilot):
         padded[:, : actions.shape[1]] = actions[: worlds.n]
         return padded
 
+    def observe(self, executed: F64) -> None:
+        """Tell a function with memory what the robots were sent."""
+        if self._observe is not None:
+            self._observe(_fill_up(executed).astype(np.float32))
+
 
 class ZooPilot(FunctionPilot):
     """A released or trained network, by name.
@@ -118,20 +128,32 @@ class ZooPilot(FunctionPilot):
         What :func:`navrep_data.zoo.load` returned.
     first_seed : int
         ``"as_released"`` starts its noise at ``first_seed + k`` for the 64 episodes from k on.
+    scaling : str
+        ``"robot"``: where the worlds' robot is not that of the policy's training, it sees and moves in proportion, see
+        :meth:`navrep_data.zoo.policy.Policy.for_robot`. ``"none"``: as trained.
+
+    Notes
+    -----
+    Memories are told the velocity that each robot was sent, which is what they were trained on. Ranges as released are
+    part of running the authors' software as it is: there they got the network's own action, in whatever unit.
     """
 
-    def __init__(self, policy: Any, first_seed: int) -> None:
+    def __init__(self, policy: Any, first_seed: int, scaling: str = "robot") -> None:
         super().__init__(policy.name, policy.act)
-        self._reset = policy.reset
         self._policy = policy
         self._first_seed = first_seed
+        self._scaling = scaling
         self.grouped = policy.inference == "as_released"
+        self._use(policy)
+
+    def _use(self, policy: Any) -> None:
+        self._policy, self._function, self._reset = policy, policy.act, policy.reset
+        self._observe = None if policy.ranges == "as_released" else policy.observe
 
     def start(self, worlds: Worlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
         """Clear the memory of new episodes, and start the noise of a group."""
-        if worlds.sensor.range_max > self._policy.sensor.range_max:
-            # the original's test does not cut ranges at the 25 m of its training: networks get them as they are
-            self._policy.sensor = replace(self._policy.sensor, range_max=worlds.sensor.range_max)
+        if self._scaling == "robot" and worlds.robot != self._policy.robot:
+            self._use(self._policy.for_robot(worlds.robot.max_speed, worlds.robot.radius))
         if self.grouped:
             first = int(episodes[mask][0]) // BLOCK * BLOCK
             self._policy.reset(batch_size=BLOCK, seed=self._first_seed + first)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,10 @@ BASELINES: dict[str, type[Pilot]] = {pilot.name: pilot for pilot in (GoalPilot, 
 """Policies without weights, by name."""
 
 INFERENCE = ("deterministic", "as_released")
+RANGES = ("contract", "as_released")
+SCALING = ("robot", "none")
+NETWORKS = ("zoo", "folder")
+"""Kinds of policies for which inference, ranges and scaling mean something."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,8 @@ class PilotSpec:
         Where files are looked for first; for a folder, the folder.
     inference : str
         deterministic or as_released.
+    ranges, scaling : str
+        contract or as_released; robot or none. See :func:`navrep_data.evaluate.benchmark`.
     files : dict
         Hashes of what decides its actions, by file.
     function : callable or None
@@ -51,6 +57,8 @@ class PilotSpec:
     kind: str
     source: str | None = None
     inference: str = "deterministic"
+    ranges: str = "contract"
+    scaling: str = "robot"
     files: dict[str, str] = field(default_factory=dict)
     function: Callable[[Any, Any], Any] | None = None
 
@@ -65,9 +73,17 @@ class PilotSpec:
         from navrep_data.zoo import load
 
         torch.set_num_threads(1)  # so that numbers do not depend on the number of cores; workers are the parallelism
-        if self.kind == "folder":
-            return ZooPilot(load(Path(str(self.source)), inference=self.inference), first_seed)
-        return ZooPilot(load(self.name, source=self.source, inference=self.inference), first_seed)
+        place, source = (Path(str(self.source)), None) if self.kind == "folder" else (self.name, self.source)
+        policy = load(place, source=source, inference=self.inference, ranges=self.ranges)
+        return ZooPilot(policy, first_seed, self.scaling)
+
+    def fed(self, inference: str, ranges: str, scaling: str) -> PilotSpec:
+        """Return this policy, run and fed in another way."""
+        return replace(self, inference=inference, ranges=ranges, scaling=scaling)
+
+    def settings(self) -> dict[str, str]:
+        """Return how a network is fed, as results record it; empty for others, for which it means nothing."""
+        return {"ranges": self.ranges, "scaling": self.scaling} if self.kind in NETWORKS else {}
 
 
 def resolve_policy(
@@ -75,6 +91,8 @@ def resolve_policy(
     source: str | os.PathLike[str] | None = None,
     inference: str = "deterministic",
     on_maps: bool = False,
+    ranges: str = "contract",
+    scaling: str | None = None,
 ) -> PilotSpec:
     """Return what a name stands for.
 
@@ -90,6 +108,8 @@ def resolve_policy(
         For the zoo's memories.
     on_maps : bool
         Whether it will drive in worlds on maps, where baselines are told the planned way.
+    ranges, scaling : str, optional
+        See :func:`navrep_data.evaluate.benchmark`; ignored for what is no network.
 
     Raises
     ------
@@ -104,6 +124,7 @@ def resolve_policy(
     """
     if inference not in INFERENCE:
         raise ConfigError(f"inference is {inference!r}, expected one of: {', '.join(INFERENCE)}.")
+    how = {"inference": inference, "ranges": ranges, "scaling": _scaling(ranges, scaling)}
     if not isinstance(policy, str):
         kind = policy if hasattr(policy, "__qualname__") else type(policy)
         name = f"{kind.__module__}:{kind.__qualname__}"
@@ -112,10 +133,30 @@ def resolve_policy(
         pilot = BASELINES[policy]
         return PilotSpec(policy, (on_maps and pilot.sees_on_maps) or pilot.sees, policy, "baseline")
     if is_path(policy):
-        return _from_folder(policy, inference)
+        return _from_folder(policy, how)
     if ":" in policy:
         return PilotSpec(policy, "scan", policy, "function", files=_hashes(load_callable(policy, BASELINES)))
-    return _from_zoo(policy, None if source is None else os.fspath(source), inference)
+    return _from_zoo(policy, None if source is None else os.fspath(source), how)
+
+
+def _scaling(ranges: str, scaling: str | None) -> str:
+    """Return how networks are scaled: to the robot, but for ranges as released, which nobody scaled."""
+    if ranges not in RANGES:
+        raise ConfigError(f"ranges is {ranges!r}, expected one of: {', '.join(RANGES)}.")
+    if scaling is None:
+        return "none" if ranges == "as_released" else "robot"
+    if scaling not in SCALING:
+        raise ConfigError(f"scaling is {scaling!r}, expected one of: {', '.join(SCALING)}.")
+    if ranges == "as_released" and scaling == "robot":
+        raise ConfigError("ranges as_released are what the authors' software feeds, unscaled: leave scaling out.")
+    return scaling
+
+
+def _not_released(name: str) -> ConfigError:
+    return ConfigError(
+        f"ranges as_released means how the authors' software feeds their networks, and {name} is none of them: leave "
+        "it out, its ranges are cut as in its training."
+    )
 
 
 def _hashes(function: Callable[..., Any]) -> dict[str, str]:
@@ -123,7 +164,7 @@ def _hashes(function: Callable[..., Any]) -> dict[str, str]:
     return {"source": digest} if digest else {}
 
 
-def _from_folder(name: str, inference: str) -> PilotSpec:
+def _from_folder(name: str, how: dict[str, str]) -> PilotSpec:
     from navrep_data.zoo import load
     from navrep_data.zoo.fetching import HUB_SCHEME
     from navrep_data.zoo.policy import Policy
@@ -135,6 +176,8 @@ def _from_folder(name: str, inference: str) -> PilotSpec:
     else:
         folder = Path(name).expanduser().resolve()
         name = os.path.normpath(name)
+    if how["ranges"] == "as_released":
+        raise _not_released(name)
     loaded = load(folder)  # told before the first episode is played
     if not isinstance(loaded, Policy):
         raise PolicyError(
@@ -142,10 +185,10 @@ def _from_folder(name: str, inference: str) -> PilotSpec:
             "wrote."
         )
     files = {part: sha256_file(path) for part, path in policy_files(folder).items()}
-    return PilotSpec(name, "scan", name, "folder", str(folder), inference, files)
+    return PilotSpec(name, "scan", name, "folder", str(folder), files=files).fed(**how)
 
 
-def _from_zoo(name: str, source: str | None, inference: str) -> PilotSpec:
+def _from_zoo(name: str, source: str | None, how: dict[str, str]) -> PilotSpec:
     from navrep_data.zoo import registry
 
     if name.partition(".")[0] not in registry.variants():
@@ -160,7 +203,9 @@ def _from_zoo(name: str, source: str | None, inference: str) -> PilotSpec:
             f"{record.name} is a {record.kind.replace('_', ' ')}, expected a policy: it does not choose actions from "
             "scans. List them: navrep-data models"
         )
+    if record.ours and how["ranges"] == "as_released":
+        raise _not_released(record.name)
     files = {e.path: e.sha256 or f"git:{e.git_blob_sha1}" for r in registry.with_parts(record) for e in r.files}
     # our run of a variant is never counted among the authors' runs of it
     variant = record.name if record.ours else record.variant
-    return PilotSpec(record.name, "scan", variant, "zoo", source, inference, files)
+    return PilotSpec(record.name, "scan", variant, "zoo", source, files=files).fed(**how)

@@ -20,7 +20,7 @@ from navrep_data.evaluate.policies import PilotSpec
 from navrep_data.evaluate.runner import Episode
 from navrep_data.evaluate.suites import Suite, get_suite
 from navrep_data.io import atomic_write_bytes, read_json
-from navrep_data.schema import Event
+from navrep_data.schema import Event, fed_as, result_name
 
 FORMAT = "navrep-data-benchmark"
 FORMAT_VERSION = 1
@@ -65,9 +65,8 @@ class Results:
 
     @property
     def name(self) -> str:
-        """Full name of the policy; says so where it ran with the noise of the release."""
-        noisy = self.header["settings"]["inference"] == "as_released"
-        return f"{self.header['name']} (as released)" if noisy else str(self.header["name"])
+        """Full name of the policy; says so where it ran with the noise of the release, or was not fed as by default."""
+        return result_name(str(self.header["name"]), self.header["settings"])
 
     @property
     def suite(self) -> Suite:
@@ -189,13 +188,16 @@ def _lines(value: dict[str, Any]) -> bytes:
 
 def header_of(spec: PilotSpec, suite: Suite, physics: str) -> dict[str, Any]:
     """Return what results say of who played what with which versions."""
+    how = fed_as(spec.settings())
     return {
         "name": spec.name,
         "sees": spec.sees,
-        "variant": spec.variant,
+        # runs that were fed otherwise are never counted among the runs of a variant
+        "variant": f"{spec.variant} ({how})" if how else spec.variant,
         "settings": {
             **suite.settings(physics),
             "inference": spec.inference,
+            **spec.settings(),
             "policy_files": spec.files,
             "navrep_data": __version__,
         },
@@ -238,4 +240,10 @@ def file_name(spec: PilotSpec) -> str:
     """Return the name of a policy's results file."""
     # a folder's name may begin with dots, and files that do are hidden
     plain = "".join(c if c.isalnum() or c in "._-" else "-" for c in spec.name).lstrip(".-") or "policy"
-    return f"{plain}.{spec.inference}.json" if spec.inference != "deterministic" else f"{plain}.json"
+    how = [spec.inference] if spec.inference != "deterministic" else []
+    fed = spec.settings()
+    if fed.get("ranges") == "as_released":  # never scaled
+        how.append("ranges-as_released")
+    elif fed.get("scaling") == "none":
+        how.append("scaling-none")
+    return ".".join([plain, *how, "json"])

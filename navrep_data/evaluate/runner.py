@@ -143,6 +143,7 @@ def play(suite: Suite, worlds: Worlds, pilot: Pilot, take: Take) -> Iterator[lis
         actions = np.clip(pilot.act(worlds), -1.0, 1.0)
         actions[~active] = 0.0
         events = worlds.step(actions)
+        pilot.observe(worlds.commands(actions))
         recorder.advance(active)
         ended = np.flatnonzero(active & (events != 0))
         yield [recorder.finish(int(w), int(playing[w]), Event(int(events[w]))) for w in ended]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from navrep_data.evaluate._polygons import orca_robots, polygon_gaps
-from navrep_data.schema import SensorContract
-from navrep_data.sim import SimConfig, Simulator, scale_actions
+from navrep_data.schema import RobotContract, SensorContract
+from navrep_data.sim import SimConfig, Simulator, robot_contract, scale_actions
 from navrep_data.sim import _layout as lay
 
 F64 = NDArray[np.float64]
@@ -26,16 +26,22 @@ class Worlds(Protocol):
         Number of worlds W.
     sensor : SensorContract
         What scans are.
+    robot : RobotContract
+        What robot it is, as policies are told.
     """
 
     n: int
     sensor: SensorContract
+    robot: RobotContract
 
     def reset(self, mask: Mask, seeds: NDArray[np.int64], scenarios: NDArray[np.int64]) -> None:
         """Start episodes in the worlds of `mask` (W,): numpy seed and index of the scenario, both (W,)."""
 
     def step(self, actions: F64) -> NDArray[np.uint8]:
         """Execute actions (W, 3) in [-1, 1] and return :class:`navrep_data.schema.Event` codes (W,)."""
+
+    def commands(self, actions: F64) -> F64:
+        """Return what robots are sent for actions (W, 3): body velocities [m/s, m/s, rad/s], within their limits."""
 
     def scans(self) -> F32:
         """Return scans (W, n_rays) [m]."""
@@ -66,7 +72,7 @@ class Worlds(Protocol):
 
 
 class PolygonWorlds:
-    """Worlds of procedural polygons: an action of 1 is 1 m/s along each axis.
+    """Worlds of procedural polygons: an action of 1 is the config's `max_velocity` along each axis.
 
     Parameters
     ----------
@@ -84,6 +90,7 @@ class PolygonWorlds:
     def __init__(self, config: SimConfig, n: int) -> None:
         self.n = n
         self.sensor = config.sensor
+        self.robot = robot_contract(config)
         self.simulator = Simulator(config, n)
         self._velocities = np.zeros((n, 2))
         self._gaps = np.zeros((2, n))
@@ -93,8 +100,12 @@ class PolygonWorlds:
         self.simulator.reset_seeded(seeds, mask)
 
     def step(self, actions: F64) -> NDArray[np.uint8]:
-        """Execute actions as velocities [m/s, m/s, rad/s]."""
-        return self.simulator.step(scale_actions(self.simulator.config, actions))[1]
+        """Execute actions as shares of the largest velocity."""
+        return self.simulator.step(self.commands(actions))[1]
+
+    def commands(self, actions: F64) -> F64:
+        """See :class:`Worlds`."""
+        return scale_actions(self.simulator.config, actions)
 
     def scans(self) -> F32:
         """See :class:`Worlds`."""
@@ -145,4 +156,4 @@ class PolygonWorlds:
 
     def speed(self) -> float:
         """See :class:`Worlds`."""
-        return 1.0
+        return self.robot.max_speed

@@ -11,6 +11,7 @@ from __future__ import annotations
 from navrep_data.observations.adapter import Lidar, ScanAdapter
 from navrep_data.observations.blind import BLIND_RANGE, fill_blind
 from navrep_data.observations.rings import RING_EDGES, rings_to_float, rings_to_scan, scan_to_rings
+from navrep_data.observations.robots import RobotScale
 from navrep_data.observations.scans import (
     metres_from_millimetres,
     millimetres_from_metres,
@@ -22,6 +23,7 @@ __all__ = [
     "BLIND_RANGE",
     "RING_EDGES",
     "Lidar",
+    "RobotScale",
     "ScanAdapter",
     "fill_blind",
     "metres_from_millimetres",

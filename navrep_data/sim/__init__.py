@@ -1,6 +1,6 @@
 """NavRepSim: worlds, humans, lidar and robot, for many independent worlds at once."""
 
-from navrep_data.sim.actions import scale_actions
+from navrep_data.sim.actions import robot_contract, scale_actions
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.gridmap import GridMap
 from navrep_data.sim.map_rollout import CallableMapRollout, ScriptedMapRollout
@@ -42,6 +42,7 @@ __all__ = [
     "make_config",
     "map_names",
     "numpy_seed",
+    "robot_contract",
     "scale_actions",
     "scenario_names",
     "warm_up",

@@ -6,8 +6,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from navrep_data.errors import ConfigError
-from navrep_data.schema import ACTION_SIZE
+from navrep_data.schema import ACTION_SIZE, TRAINING_RADIUS, RobotContract
 from navrep_data.sim.config import SimConfig
+from navrep_data.sim.map_tables import RADIUS
+
+
+def robot_contract(config: SimConfig) -> RobotContract:
+    """Return what the robot of an environment is: the speed of a full action, and the radius.
+
+    Parameters
+    ----------
+    config : SimConfig
+        Its `max_velocity` along x counts. On maps the radius is always 0.3 m; elsewhere it is drawn from 0.3 to 0.5 m
+        for every episode, and its mean stands for it.
+    """
+    return RobotContract(config.max_velocity[0], RADIUS if config.world == "map" else TRAINING_RADIUS)
 
 
 def scale_actions(config: SimConfig, actions: ArrayLike) -> NDArray[np.float64]:

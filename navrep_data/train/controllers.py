@@ -18,6 +18,7 @@ from navrep_data.io import atomic_write_json
 from navrep_data.models import Controller, EndToEnd, checkpoint
 from navrep_data.schema import Event, SensorContract
 from navrep_data.shards import writer_lock
+from navrep_data.sim import robot_contract
 from navrep_data.train import state
 from navrep_data.train.controller_recipe import (
     AUTHORS_HELD_OUT,
@@ -224,6 +225,7 @@ class _Run(BaseCallback):
             "context": self.policy_now.context,
             "world_model": None if e2e else PARTS,
             "sensor": SensorContract().to_dict(),
+            "robot": robot_contract(environment(self.recipe)).to_dict(),
         }
 
     def train(self, stop: int, progress: bool, report: Callable[[str], None] | None) -> TrainedController:

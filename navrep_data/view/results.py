@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, NavrepDataError
 from navrep_data.io import read_json
-from navrep_data.schema import DT, EVENT_NAMES
+from navrep_data.schema import DT, EVENT_NAMES, result_name
 from navrep_data.view.packing import Blob
 from navrep_data.view.page import DEFAULT_MAX_BYTES, MIN_MAX_BYTES, Page, assemble, clip
 
@@ -189,9 +189,8 @@ def _parse(value: Any, file: Path) -> _Policy:
         if lengths != {n}:
             raise ValueError("columns of different lengths")
         played = [k for k in range(n) if columns["event"][k]][:MAX_EPISODES]
-        noisy = settings.get("inference") == "as_released"
         return _Policy(
-            name=clip(value["name"], 120) + (" (as released)" if noisy else ""),
+            name=result_name(clip(value["name"], 120), settings),
             sees=clip(value.get("sees", ""), 60),
             settings=settings,
             number=played,

@@ -81,12 +81,14 @@ def load(
     seed : int
         Seed of ``"as_released"``.
     **options
-        Passed on: ``dtype``, ``compile``, ``device``.
+        Passed on: ``dtype``, ``compile``, ``device``; of policies ``ranges``, see
+        :class:`navrep_data.zoo.policy.Policy`.
 
     Returns
     -------
     navrep_data.zoo.policy.Policy or torch.nn.Module
-        A policy for names with features and for ``e2e_*``; otherwise a world model, a V or an M.
+        A policy for names with features and for ``e2e_*``; otherwise a world model, a V or an M. A policy is for the
+        robot of its training (1 m/s); ``policy.for_robot(max_speed=0.55, radius=0.3)`` is the same for a slower one.
 
     Raises
     ------

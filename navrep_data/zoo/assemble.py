@@ -16,6 +16,7 @@ from navrep_data.models.noise import Noise
 from navrep_data.models.vae import VAE
 from navrep_data.models.world_model import WorldModel
 from navrep_data.schema import SensorContract
+from navrep_data.zoo.folders import trained_robot
 from navrep_data.zoo.importers import load_any, load_controller_zip, load_tf_json, load_torch_world_model
 from navrep_data.zoo.policy import INFERENCE, Policy
 
@@ -31,18 +32,20 @@ def build(
     compile: bool = False,
     device: str = "cpu",
     context: str | None = None,
+    ranges: str = "contract",
 ) -> Policy | nn.Module:
     """Return the model of a record.
 
     Parameters
     ----------
     record : mapping
-        A registry record; read are name, kind, format, lidar, features, z_size, n_inputs, context_rule and sensor.
+        A registry record; read are name, kind, format, lidar, features, z_size, n_inputs, context_rule, sensor and
+        robot.
     files : mapping of str to pathlib.Path
         Its files, by path in the record.
     parts : mapping of str to object
         What it is joined with, by role: ``world_model``, ``vae``, ``memory``; built before, by this function.
-    inference, seed, dtype, compile, device
+    inference, seed, dtype, compile, device, ranges
         As for :class:`Policy`; world models take `inference`, `seed` and `device`.
     context : str, optional
         Instead of the record's context rule.
@@ -82,6 +85,8 @@ def build(
             compile=compile,
             device=device,
             sensor=sensor,
+            ranges=ranges,
+            robot=trained_robot(record),
         )
     model: nn.Module
     if kind == "world_model" and not files:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from navrep_data.errors import CheckpointError, ConfigError, ModelNotFoundError
 from navrep_data.io import atomic_write_json, read_json
-from navrep_data.schema import SensorContract
+from navrep_data.schema import RobotContract, SensorContract
 
 if TYPE_CHECKING:
     from torch import nn
@@ -90,6 +90,7 @@ def save_policy(policy: Policy, folder: Path | str, metadata: Mapping[str, Any] 
             "lidar": policy.lidar,
             "context": policy.context,
             "sensor": policy.sensor.to_dict(),
+            "robot": policy.trained_on.to_dict(),
             "parts": list(parts),
             "metadata": dict(metadata or {}),
         },
@@ -143,6 +144,22 @@ def check_described(found: Mapping[str, Any], path: Path, more: Mapping[str, tup
         sensor = {}
     if set(sensor) != set(SensorContract().to_dict()):
         raise CheckpointError(f"{path}: sensor is no sensor contract; get the policy again.")
+    try:
+        trained_robot(found)
+    except (ConfigError, TypeError) as error:
+        raise CheckpointError(f"{path}: robot is no robot's speed and radius; get the policy again.") from error
+
+
+def trained_robot(found: Mapping[str, Any]) -> RobotContract | None:
+    """Return the robot that a described policy was trained on, None where nothing is said: that of navrep-train.
+
+    Raises
+    ------
+    ConfigError, TypeError
+        If it is no speed and radius.
+    """
+    robot = found.get("robot")
+    return None if robot is None else RobotContract(**robot)
 
 
 def load_folder(
@@ -186,6 +203,7 @@ def load_folder(
     record = {
         "name": name, "kind": "policy", "format": "safetensors", "features": found["features"],
         "lidar": found["lidar"], "context_rule": found["context"], "sensor": found["sensor"],
+        "robot": found.get("robot"),
     }  # fmt: skip
     return build(record, _files(path / CONTROLLER), parts, inference=inference, seed=seed, **options)
 

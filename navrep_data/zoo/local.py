@@ -9,7 +9,7 @@ from typing import Any
 from navrep_data.errors import CheckpointError
 from navrep_data.io import read_json
 from navrep_data.schema import SensorContract
-from navrep_data.zoo.folders import check_described
+from navrep_data.zoo.folders import check_described, trained_robot
 
 POLICY_FILE = "policy.json"
 """Beside a controller's weights: what it sees through."""
@@ -102,5 +102,13 @@ def load_policy(folder: Path, **options: Any) -> Any:
     world_model = model if isinstance(model, WorldModel) and features != "z" else None
     vae = model if isinstance(model, VAE) else getattr(model, "vae", None)
     return Policy(
-        network, features, lidar, vae, world_model, context=context, sensor=sensor, **{"name": folder.name, **options}
+        network,
+        features,
+        lidar,
+        vae,
+        world_model,
+        context=context,
+        sensor=sensor,
+        robot=trained_robot(found),
+        **{"name": folder.name, **options},
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any, TypeVar
 
@@ -18,14 +19,16 @@ from navrep_data.models.noise import Noise
 from navrep_data.models.observation import observation_from_scan
 from navrep_data.models.vae import VAE
 from navrep_data.models.world_model import Stream, WorldModel
-from navrep_data.observations import fill_blind
-from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, SensorContract
+from navrep_data.observations import RobotScale, fill_blind
+from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, RobotContract, SensorContract
 
 INFERENCE = ("deterministic", "as_released")
+RANGES = ("contract", "as_released")
 FEATURES = ("z", "h", "zh")
 _ADAPT = "put the sensor's scans through navrep_data.observations.ScanAdapter"
-# The farthest range that a scan of this contract may hold, as a multiple of range_max: beyond it is another unit.
-_FAR = 2.0
+# The farthest range that a scan may hold, as a multiple of range_max: beyond it is another unit. Halls and maps are
+# wider than a contract (ranges are cut there); 1000 m are less than a scan in millimetres has in any room.
+_FAR = 40.0
 
 ArrayT = TypeVar("ArrayT", NDArray[Any], Tensor)
 
@@ -68,6 +71,19 @@ class Policy:
         :class:`navrep_data.models.QuantizedEncoder`.
     sensor : SensorContract
         What scans must be.
+    ranges : str
+        ``"contract"``: ranges beyond the sensor's `range_max` are cut there, as in training. ``"as_released"``: they
+        reach the network as they are, as in the authors' test, where a map is up to 109 m wide.
+    robot : RobotContract
+        What the policy was trained on; the robot of ``navrep-train`` if left out. For another robot see
+        :meth:`for_robot`.
+
+    Attributes
+    ----------
+    trained_on : RobotContract
+        The robot of its training.
+    robot : RobotContract
+        The robot that it drives: an action of 1 is this robot's ``max_speed``.
 
     Raises
     ------
@@ -98,14 +114,21 @@ class Policy:
         device: str | torch.device = "cpu",
         encoder: torch.nn.Module | None = None,
         sensor: SensorContract | None = None,
+        ranges: str = "contract",
+        robot: RobotContract | None = None,
     ) -> None:
         if inference not in INFERENCE:
             raise ConfigError(f"inference is {inference!r}, expected one of: {', '.join(INFERENCE)}.")
+        if ranges not in RANGES:
+            raise ConfigError(f"ranges is {ranges!r}, expected one of: {', '.join(RANGES)}.")
         if features is not None and features not in FEATURES:
             raise ConfigError(f"features is {features!r}, expected one of: {', '.join(FEATURES)}, or None.")
         self.name = name
         self.features, self.lidar = features, lidar
         self.sensor = SensorContract() if sensor is None else sensor
+        self.ranges = ranges
+        self.trained_on = self.robot = RobotContract() if robot is None else robot
+        self._scale: RobotScale | None = None
         self.device = torch.device(device)
         self.context, self.inference, self.seed = context, inference, seed
         self.network = network.to(self.device).eval()
@@ -164,6 +187,46 @@ class Policy:
     def __repr__(self) -> str:
         return f"Policy({self.name!r}, lidar={self.lidar!r}, features={self.features!r}, inference={self.inference!r})"
 
+    def for_robot(self, max_speed: float | None = None, radius: float | None = None) -> Policy:
+        """Return this policy for a robot of another top speed or size, with a memory of its own.
+
+        Parameters
+        ----------
+        max_speed : float, optional
+            Velocity along x and y that an action of 1 stands for on that robot [m/s]; as trained if left out.
+        radius : float, optional
+            Radius of its footprint [m]; as trained if left out.
+
+        Returns
+        -------
+        Policy
+            Takes that robot's scans, robot states and executed velocities in metres and m/s, and returns shares of that
+            robot's top speed. The networks are shared.
+
+        Raises
+        ------
+        ConfigError
+            If a number is not positive, or ranges are as released: the authors' software scales nothing.
+
+        Notes
+        -----
+        :class:`navrep_data.observations.RobotScale` says what is scaled and how; docs/experiments.md how that was
+        chosen.
+        """
+        robot = RobotContract(
+            self.trained_on.max_speed if max_speed is None else max_speed,
+            self.trained_on.radius if radius is None else radius,
+        )
+        if robot != self.trained_on and self.ranges == "as_released":
+            raise ConfigError(f"{self._who()} takes ranges as released, which are not scaled: load it without ranges=.")
+        other = copy.copy(self)
+        other.robot = robot
+        other._scale = None if robot == self.trained_on else RobotScale(self.trained_on, robot, self.sensor.range_max)
+        other._stream, other._noise, other._waiting = None, None, None
+        other._fresh = torch.zeros(0, dtype=torch.bool, device=self.device)
+        other._last = torch.zeros(0, ACTION_SIZE, device=self.device)
+        return other
+
     # --- episodes ----------------------------------------------------------------------------------------------
 
     def reset(
@@ -210,12 +273,14 @@ class Policy:
             self._stream = self.world_model.stream(n, self.context, self._noise)
 
     def observe(self, executed_action: ArrayLike | Tensor) -> None:
-        """Tell what the robots did since the last :meth:`encode`, where it is not what :meth:`act` returned.
+        """Tell what the robots did since the last :meth:`encode`, where it is not what :meth:`act` asked for.
 
         Parameters
         ----------
         executed_action : ndarray of shape (B, 2) or (B, 3) [m/s, m/s, rad/s]
-            Body velocities after clipping and scaling; memories are fed them at the next step.
+            Body velocities of the robot as its base received them, after clipping and limits: what the ``action``
+            column of datasets holds. Memories are fed them at the next step, for another robot in the proportions of
+            the one they were trained on.
 
         Raises
         ------
@@ -228,6 +293,8 @@ class Policy:
                 f"executed_action has shape {tuple(action.shape)}, expected ({len(self._last)}, 3) or "
                 f"({len(self._last)}, 2): one row per robot since reset(batch_size=...)."
             )
+        if self._scale is not None:
+            action = torch.cat([action[:, :2] * self._scale.factor, action[:, 2:]], dim=1)
         self._last = torch.nn.functional.pad(action, (0, ACTION_SIZE - action.shape[1])).clone()
 
     # --- steps -------------------------------------------------------------------------------------------------
@@ -239,14 +306,14 @@ class Policy:
         Parameters
         ----------
         scan : ndarray or Tensor of shape (B, 1080) [m]
-            Ranges; ray 0 straight ahead, anticlockwise, 25 where a ray hits nothing.
+            Ranges; ray 0 straight ahead, anticlockwise, 25 or more where a ray hits nothing.
         robot_state : ndarray or Tensor of shape (B, 5) [m, m, m/s, m/s, rad/s]
             Goal x, y, velocity x, y and turn rate, robot frame.
 
         Returns
         -------
         ndarray or Tensor of shape (B, 3), float32
-            Velocity x, y in [-1, 1], and 0; of the kind that `scan` is.
+            Velocity x, y in [-1, 1] as shares of ``robot.max_speed``, and 0; of the kind that `scan` is.
 
         Raises
         ------
@@ -262,8 +329,9 @@ class Policy:
             mean = self.network.mean(self.network.pi(inputs))
         else:
             mean = self.network.mean(self.network.pi(features))
-        self._last = torch.nn.functional.pad(self.network.command(mean), (0, ACTION_SIZE - mean.shape[1]))
-        action: ArrayT = _like(self._last.clone(), scan)
+        chosen = torch.nn.functional.pad(self.network.command(mean), (0, ACTION_SIZE - mean.shape[1]))
+        self._last = chosen * self.trained_on.max_speed
+        action: ArrayT = _like(chosen, scan)
         return action
 
     __call__ = act
@@ -315,7 +383,7 @@ class Policy:
             As given, float32.
         """
         assert self.lidar is not None
-        ranges, state = np.ascontiguousarray(scan, np.float32), _tensor(robot_state, self.device)
+        ranges, state = self._fitted(np.asarray(scan, np.float32), _tensor(robot_state, self.device))
         if self.features == "h":
             return state.cpu().numpy(), state.cpu().numpy()
         obs = observation_from_scan(ranges, self.lidar, self.features is not None).to(self.device)
@@ -426,18 +494,31 @@ class Policy:
                 f"scan has {len(ranges)} rows, expected {len(self._last)}: call reset(batch_size={len(ranges)}) before "
                 "the first step of another number of robots."
             )
-        return np.ascontiguousarray(ranges, dtype=np.float32), state
+        return self._fitted(ranges, state)
+
+    def _fitted(self, ranges: NDArray[Any], state: Tensor) -> tuple[NDArray[np.float32], Tensor]:
+        """Return ranges and robot states as the networks know them: within the contract, of the robot of training."""
+        ranges = np.ascontiguousarray(ranges, dtype=np.float32)
+        if self.ranges == "contract":
+            ranges = np.minimum(ranges, np.float32(self.sensor.range_max))
+        if self._scale is None:
+            return ranges, state
+        factors = torch.full((ROBOT_STATE_SIZE,), self._scale.factor, device=state.device)
+        factors[-1] = 1.0  # time is not scaled, so turn rates are not
+        return self._scale.ranges(ranges), state * factors
 
     def check_sensor(self, sensor: SensorContract) -> None:
-        """Raise unless scans of `sensor` are what the policy takes.
+        """Raise unless scans of `sensor` are what the policy takes; ranges may be longer, they are cut.
 
         Raises
         ------
         ConfigError
-            If rays, angles or range differ.
+            If rays, angles or time step differ, or the range is shorter.
         """
         mine, other = self.sensor.to_dict(), sensor.to_dict()
         for field, value in mine.items():
+            if field == "range_max" and other[field] > value:
+                continue
             if abs(float(value) - float(other[field])) > 1e-4:
                 raise ConfigError(f"{self._who()} takes scans with {field} = {value}, got {other[field]}: {_ADAPT}.")
 

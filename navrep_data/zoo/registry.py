@@ -108,6 +108,8 @@ class Record:
     training : dict or None
         How this project trained it: commands, settings, seed, dataset, steps, seconds, machine, what half precision
         costs, validation. None for the authors' checkpoints.
+    robot : dict or None
+        Of policies: fields of :class:`navrep_data.schema.RobotContract`, the robot that it was trained on.
     """
 
     name: str
@@ -138,6 +140,7 @@ class Record:
     notes: tuple[str, ...]
     results: tuple[dict[str, Any], ...]
     training: dict[str, Any] | None = None
+    robot: dict[str, float] | None = None
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Record:

@@ -11,11 +11,13 @@ from navrep_data.evaluate.reproduce.drawn import COLOURS, HATCHES, Drawn, Missin
 from navrep_data.evaluate.results import NOT_PLAYED, Results
 from navrep_data.evaluate.sources import find_benchmarks, source_of
 from navrep_data.evaluate.statistics import spread, wilson
+from navrep_data.schema import fed_as
 from navrep_data.sim.scenarios import MAP_GROUPS
 
 PARTS = ("all", *MAP_GROUPS)
 _MEASURED = ("released", "ours", "other", "baseline")
 _WIDTH = 0.27
+_AUTHORS_WAY = fed_as({"ranges": "as_released"})
 Score = dict[str, Any]
 
 
@@ -23,15 +25,20 @@ def scores(found: Sequence[Results]) -> dict[str, dict[str, dict[str, Score]]]:
     """Return success by variant, source and part (all, maps).
 
     Several runs of a variant are one score, from the least to the greatest of them; a single one has Wilson's interval.
+    Beside the authors' numbers stand runs of their networks that were fed as their software does it, where there are.
     """
-    runs: dict[tuple[str, str], list[Results]] = {}
+    fed: dict[tuple[str, str], dict[str, list[Results]]] = {}
     for results in found:
-        if results.header["settings"]["inference"] == "deterministic":
-            source = source_of(results.header["name"])
-            name = results.header["name"].partition(".")[0] if source == "ours" else results.header["variant"]
-            runs.setdefault((name, source), []).append(results)
+        settings = results.header["settings"]
+        if settings["inference"] == "deterministic":
+            source, name = source_of(results.header["name"]), results.header["variant"]
+            name = results.header["name"].partition(".")[0] if source == "ours" else name.partition(" (")[0]
+            fed.setdefault((name, source), {}).setdefault(fed_as(settings), []).append(results)
+    runs = {key: of.get(_AUTHORS_WAY) or of.get("") for key, of in fed.items()}
     merged: dict[str, dict[str, dict[str, Score]]] = {}
     for (variant, source), of in runs.items():
+        if of is None:  # only as trained
+            continue
         parts = ("all", *of[0].suite.maps)
         merged.setdefault(variant, {})[source] = {part: _merge(of, part) for part in parts}
     return merged
