@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 
 from navrep_data.envs import record
+from navrep_data.schema import Event
 
 
 def careful(observation: dict[str, np.ndarray]) -> np.ndarray:
@@ -45,7 +46,7 @@ def main() -> None:
     while left.any():
         observations, _, _, _, infos = env.step(careful(observations))
         for i in np.flatnonzero(infos.get("_final_info", np.zeros(arguments.worlds, bool)) & (left > 0)):
-            endings[infos["final_info"]["event"][i]] += 1
+            endings[Event(infos["final_info"]["event"][i]).label] += 1
             left[i] -= 1
     total = sum(endings.values())
     print(f"{total} episodes: " + ", ".join(f"{event} {100 * n / total:.0f} %" for event, n in endings.most_common()))

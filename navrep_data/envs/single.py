@@ -18,6 +18,7 @@ from navrep_data.envs.worlds import (
     action_space,
     make_env_config,
     observation_space,
+    with_length,
 )
 from navrep_data.sim import SimConfig
 from navrep_data.sim.raster import Camera, draw_frame
@@ -94,6 +95,7 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         # gymnasium's checker tries what an instance offers, gymnasium.make what the class does
         fps = max(1, round(1.0 / self.config.sensor.dt))
         self.metadata = {"render_modes": available_render_modes(), "render_fps": fps}
+        self._spec: Any = None
         self._worlds = Worlds(self.config, 1, episode)
         self._pad_humans = pad_humans
         self._running = False
@@ -103,6 +105,15 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._window: Window | None = None
         self.observation_space = observation_space(self.config)
         self.action_space = action_space(self.config)
+
+    @property
+    def spec(self) -> Any:
+        """What gymnasium knows of the environment, with the most steps of an episode; set by ``gymnasium.make``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: Any) -> None:
+        self._spec = with_length(spec, self.config.max_steps)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -183,8 +194,8 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         }
         if self._worlds.numbered:
             info["seed"] = int(self._worlds.seeds[0])
-        for name in self._worlds.scenarios():
-            info["scenario"] = name
+        for index in self._worlds.scenarios():
+            info["scenario"] = self.config.scenarios[index]
         return info
 
     def frame(self, size: int = 480) -> NDArray[np.uint8]:

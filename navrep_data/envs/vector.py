@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from navrep_data.envs.window import check_render_mode
 from navrep_data.envs.worlds import (
-    EVENT_LABELS,
     F64,
     TERMINAL,
     Mask,
@@ -22,19 +21,38 @@ from navrep_data.envs.worlds import (
     action_space,
     make_env_config,
     observation_space,
+    with_length,
 )
-from navrep_data.errors import ConfigError
+from navrep_data.errors import ConfigError, did_you_mean
+from navrep_data.schema import Event
 from navrep_data.sim import SimConfig
 from navrep_data.sim.raster import Camera, draw_frame
 
 Infos = dict[str, Any]
 
 
+def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        known = [known.value for known in AutoresetMode]
+        raise ConfigError(
+            f"autoreset_mode is {str(mode)[:40]!r}, expected one of: {', '.join(known)}.{did_you_mean(str(mode), known)}"
+        ) from None
+
+
+def _at_least_one(name: str, value: int | None) -> int | None:
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+        raise ConfigError(f"{name} is {str(value)[:40]}, expected a whole number of at least 1.")
+    return value
+
+
 class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """Many worlds that step together: what ``gymnasium.make_vec(..., vectorization_mode="vector_entry_point")`` makes.
 
-    World i plays what :class:`NavRepEnv` plays with ``seed + i`` or ``episode + i``, bit for bit, whatever the number
-    of worlds. A world whose episode ends starts its next one in the same step (SAME_STEP).
+    World i starts with the episode that :class:`NavRepEnv` plays with ``seed + i`` or ``episode + i``, bit for bit,
+    whatever the number of worlds. Later episodes are those of the single environment, too, where seeds name streams;
+    numbered episodes go on in steps of `num_envs` (seed + i + num_envs, ...), so that the worlds share the list out.
 
     Parameters
     ----------
@@ -48,6 +66,12 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         World i starts with number ``episode + i`` at its first bare reset and goes on in steps of `num_envs`.
     render_mode : str, optional
         ``"rgb_array"``: :meth:`render` returns a picture of each world.
+    autoreset_mode : gymnasium.vector.AutoresetMode or str
+        When a world whose episode has ended starts its next one. ``"SameStep"``: in that step. ``"NextStep"``: in the
+        next one, whose action it ignores (reward 0); gymnasium's wrappers of vector observations want this.
+        ``"Disabled"``: by ``reset(options={"reset_mask": mask})`` of yours, before the next step. Same episodes in all.
+    max_episode_steps : int, optional
+        Cut episodes after so many steps (truncated, event ``cut``), as gymnasium's TimeLimit does.
     **changes
         Other fields of :class:`navrep_data.sim.SimConfig`.
 
@@ -55,10 +79,11 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
     -----
     Observations are dictionaries of arrays with a leading axis of worlds; rewards (N,) float64; terminations and
     truncations (N,) bool. ``infos`` follow gymnasium's convention, ``_key`` (N,) bool saying for whom a value holds:
-    ``robot`` (N, 3), ``humans`` (N, most humans, 4) with NaN in empty slots, ``event`` (N,) str, ``seed`` (N,) and
-    ``scenario`` (N,) where there are such. Where episodes ended, ``final_obs`` (N,) holds their last observations (None
-    elsewhere) and ``final_info`` the infos of their last steps, with the reason; observations are those of the next
-    episodes.
+    ``robot`` (N, 3), ``humans`` (N, most humans, 4) with NaN in empty slots, ``event`` (N,) uint8, codes of
+    :class:`navrep_data.schema.Event` (``Event(code).label`` is what a single environment's info says), ``seed`` (N,)
+    and ``scenario`` (N,), index in ``config.scenarios``, where there are such; all of them numbers, which wrappers can
+    convert. Where episodes ended with SAME_STEP, ``final_obs`` (N,) holds their last observations (None elsewhere) and
+    ``final_info`` the infos of their last steps, with the reason; observations are those of the next episodes.
 
     ``reset(options={"reset_mask": mask})`` resets some worlds only.
     """
@@ -77,14 +102,22 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         physics: str | None = None,
         episode: int | None = None,
         render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        max_episode_steps: int | None = None,
         **changes: Any,
     ) -> None:
         self.config = make_env_config(env, physics=physics, **changes)
         self.num_envs = num_envs
         self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
-        self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.config.sensor.dt))}
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
+        fps = max(1, round(1.0 / self.config.sensor.dt))
+        self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
+        self._spec: Any = None
+        self._most_steps = _at_least_one("max_episode_steps", max_episode_steps)
         self._worlds = Worlds(self.config, num_envs, episode)
         self._running = False
+        self._steps = np.zeros(num_envs, np.int64)
+        self._ended = np.zeros(num_envs, np.bool_)  # worlds that wait for their next episode
         self._trails: list[list[F64]] = [[] for _ in range(num_envs)]
         self._cameras: list[Camera | None] = [None] * num_envs
         self._scans: NDArray[np.float32] | None = None
@@ -92,6 +125,15 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         self.single_action_space = action_space(self.config)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
+
+    @property
+    def spec(self) -> Any:
+        """What gymnasium knows of the environment, with the most steps of an episode; set by ``gymnasium.make_vec``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: Any) -> None:
+        self._spec = with_length(spec, self._most_steps or self.config.max_steps)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -148,12 +190,13 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
 
     def _restart(self, mask: Mask) -> None:
         self._worlds.restart(mask)
+        self._steps[mask], self._ended[mask] = 0, False
         if self.render_mode is not None:
             for i in np.flatnonzero(mask):
                 self._trails[i], self._cameras[i] = [], None
 
     def step(self, actions: ArrayLike) -> tuple[Observation, F64, Mask, Mask, Infos]:
-        """Drive all worlds for one time step; worlds whose episode ended start the next.
+        """Drive all worlds for one time step; worlds whose episode ended start the next, see `autoreset_mode`.
 
         Parameters
         ----------
@@ -168,22 +211,46 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         Raises
         ------
         gymnasium.error.ResetNeeded
-            If no episode has begun.
+            If no episode has begun, or one has ended that only you reset.
         """
         if not self._running:
             raise gymnasium.error.ResetNeeded("No episode has begun: call reset() before step().")
-        rewards = self._worlds.step(actions)
+        stepped = ~self._ended
+        if not stepped.all():
+            self._start_waiting()
+        rewards = self._worlds.step(actions, None if stepped.all() else stepped)
+        self._cut(stepped)
         events = self._worlds.events
         done = events != 0
         terminations = TERMINAL[events]
         truncations = done & ~terminations
         each = rewards if rewards.ndim > 1 else None
         infos: Infos = {}
-        if done.any():
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+            self._ended = done
+        elif done.any():
             infos = self._final(done, each)
             self._restart(done)
-        infos.update(self._infos(np.ones(self.num_envs, np.bool_), None if each is None else each, ~done))
+            stepped = ~done
+        infos.update(self._infos(np.ones(self.num_envs, np.bool_), None if each is None else each, stepped))
         return self._observe(), rewards if each is None else each.mean(axis=1), terminations, truncations, infos
+
+    def _start_waiting(self) -> None:
+        """Start the next episodes of worlds whose last one ended in the step before."""
+        if self.autoreset_mode is AutoresetMode.DISABLED:
+            which = ", ".join(map(str, np.flatnonzero(self._ended)[:8]))
+            raise gymnasium.error.ResetNeeded(
+                f"The episodes of worlds {which} have ended: call reset(options={{'reset_mask': terminations | "
+                "truncations}) before step()."
+            )
+        self._restart(self._ended.copy())
+
+    def _cut(self, stepped: Mask) -> None:
+        """Count the steps, and end episodes that have had as many as `max_episode_steps` says."""
+        self._steps += stepped
+        if self._most_steps is not None:
+            over = stepped & (self._steps >= self._most_steps) & (self._worlds.events == 0)
+            self._worlds.events[over] = Event.CUT
 
     def _observe(self) -> Observation:
         observations = self._worlds.observe()
@@ -196,18 +263,18 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
     def _infos(self, mask: Mask, rewards: F64 | None = None, stepped: Mask | None = None) -> Infos:
         """Return the infos of the worlds of `mask`; rewards hold for `stepped`."""
         humans, robots = self._worlds.humans(), self._worlds.robots()
-        labels = EVENT_LABELS[self._worlds.events]
+        events = self._worlds.events.copy()
         if not mask.all():
-            humans[~mask], robots[~mask], labels[~mask] = 0.0, 0.0, None
+            humans[~mask], robots[~mask], events[~mask] = 0.0, 0.0, 0
         infos: Infos = {
             "robot": robots, "_robot": mask, "humans": humans, "_humans": mask.copy(),
-            "event": labels, "_event": mask.copy(),
+            "event": events, "_event": mask.copy(),
         }  # fmt: skip
         if self._worlds.numbered:
             infos |= {"seed": np.where(mask, self._worlds.seeds, 0), "_seed": mask.copy()}
         scenarios = self._worlds.scenarios()
         if len(scenarios):
-            scenarios[~mask] = None
+            scenarios[~mask] = 0
             infos |= {"scenario": scenarios, "_scenario": mask.copy()}
         if rewards is not None and stepped is not None and stepped.any():
             infos |= {"rewards": rewards * stepped[:, None], "_rewards": stepped}

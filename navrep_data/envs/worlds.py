@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -67,6 +68,18 @@ def state_bounds(config: SimConfig) -> tuple[F32, F32]:
     high = np.array([reach, reach, speed, speed, 2.0 * omega], np.float32)
     assert len(high) == ROBOT_STATE_SIZE
     return -high, high
+
+
+def with_length(spec: Any, most_steps: int | None) -> Any:
+    """Return a copy of an environment's spec that says how many steps an episode has at most.
+
+    The registered spec does not, since settings change it; and gymnasium would cut episodes beside the simulator.
+    """
+    if spec is None or spec.max_episode_steps is not None:
+        return spec
+    spec = copy.deepcopy(spec)
+    spec.max_episode_steps = most_steps
+    return spec
 
 
 class Worlds:
@@ -181,12 +194,15 @@ class Worlds:
             self.sim.reset_seeded(self.seeds, others)
         self._next[mask] += self.n
 
-    def step(self, actions: ArrayLike) -> F64:
-        """Advance all under actions in [-1, 1], (n, 3) or (n, robots, 3); returns rewards, sets :attr:`events`."""
+    def step(self, actions: ArrayLike, mask: Mask | None = None) -> F64:
+        """Advance all, or those of `mask`, under actions in [-1, 1], (n, 3) or (n, robots, 3).
+
+        Returns rewards and sets :attr:`events`; both are 0 outside `mask`.
+        """
         commands = np.asarray(actions, np.float64)
         if commands.shape != (self.n, *self._lead, ACTION_SIZE):
             raise ConfigError(f"action has shape {commands.shape[1:]}, expected {(*self._lead, ACTION_SIZE)}.")
-        rewards, self.events = self.sim.step(scale_actions(self.config, commands))
+        rewards, self.events = self.sim.step(scale_actions(self.config, commands), mask)
         return rewards
 
     def observe(self, mask: Mask | None = None) -> Observation:
@@ -207,11 +223,11 @@ class Worlds:
         out[np.arange(out.shape[1]) >= self.human_counts()[:, None]] = np.nan
         return out
 
-    def scenarios(self) -> NDArray[np.object_]:
-        """Return the names of the scenarios that are played, (n,) str; nothing where there are none."""
+    def scenarios(self) -> NDArray[np.int64]:
+        """Return which of the config's scenarios are played, (n,) indices; nothing where there are none."""
         if self.sim.maps is None or not self._scenarios:
-            return np.zeros(0, object)
-        return np.array(self.config.scenarios, object)[self.sim.maps.scenarios_played()]
+            return np.zeros(0, np.int64)
+        return self.sim.maps.scenarios_played()
 
     def grid(self, world: int) -> GridMap | None:
         """Return the map that a world is on, None where there is none."""

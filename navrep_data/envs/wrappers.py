@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -45,47 +46,65 @@ def _scan_space(env: Any, space: gymnasium.Space[Any]) -> tuple[gymnasium.spaces
     return before, shape
 
 
+@dataclass(frozen=True)
+class _ToRings:
+    """Makes rings of scans; a class, so that wrapped environments can be pickled."""
+
+    zero_first_bin: bool
+
+    def __call__(self, observation: dict[str, Any]) -> dict[str, Any]:
+        rings = rings_to_float(scan_to_rings(observation["scan"]), zero_first_bin=self.zero_first_bin)
+        return {"rings": rings, "robot_state": observation["robot_state"]}
+
+
+@dataclass(frozen=True)
+class _To1d:
+    """Divides ranges by the largest."""
+
+    range_max: float
+
+    def __call__(self, observation: dict[str, Any]) -> dict[str, Any]:
+        scan = scan_to_1d(fill_blind(observation["scan"]), self.range_max)
+        return {"1d": scan, "robot_state": observation["robot_state"]}
+
+
+@dataclass(frozen=True)
+class _ToFlat:
+    """Puts an observation's parts side by side; `axes`: how many of each part are its own."""
+
+    axes: tuple[tuple[str, int], ...]
+
+    def __call__(self, observation: dict[str, Any]) -> F32:
+        parts = []
+        for name, own in self.axes:
+            values = np.asarray(observation[name], np.float32)
+            parts.append(values.reshape(*values.shape[: values.ndim - own], -1))
+        return np.concatenate(parts, axis=-1)
+
+
 def _rings(env: Any, space: gymnasium.Space[Any], zero_first_bin: bool) -> tuple[gymnasium.Space[Any], Transform]:
     before, shape = _scan_space(env, space)
     if not _sensor(env).covers_full_turn():
         raise ConfigError("rings need a scan of a full turn: the sensor's n_rays x angle_increment is not 2 pi.")
-
-    def transform(observation: dict[str, Any]) -> dict[str, Any]:
-        rings = rings_to_float(scan_to_rings(observation["scan"]), zero_first_bin=zero_first_bin)
-        return {"rings": rings, "robot_state": observation["robot_state"]}
-
     rings_space = gymnasium.spaces.Box(0.0, 1.0, (*shape[:-1], *RINGS_SHAPE), np.float32)
-    return gymnasium.spaces.Dict(rings=rings_space, robot_state=before["robot_state"]), transform
+    return gymnasium.spaces.Dict(rings=rings_space, robot_state=before["robot_state"]), _ToRings(zero_first_bin)
 
 
 def _scan1d(env: Any, space: gymnasium.Space[Any]) -> tuple[gymnasium.Space[Any], Transform]:
     before, shape = _scan_space(env, space)
-    range_max = _sensor(env).range_max
-
-    def transform(observation: dict[str, Any]) -> dict[str, Any]:
-        scan = scan_to_1d(fill_blind(observation["scan"]), range_max)
-        return {"1d": scan, "robot_state": observation["robot_state"]}
-
     scan_space = gymnasium.spaces.Box(0.0, 1.0, shape, np.float32)
-    return gymnasium.spaces.Dict({"1d": scan_space, "robot_state": before["robot_state"]}), transform
+    new = gymnasium.spaces.Dict({"1d": scan_space, "robot_state": before["robot_state"]})
+    return new, _To1d(_sensor(env).range_max)
 
 
 def _flat(env: Any, space: gymnasium.Space[Any]) -> tuple[gymnasium.Space[Any], Transform]:
     before = _dictionary(space)
     names = [*(name for name in before.spaces if name != "robot_state"), "robot_state"]
-    axes = {name: len(before[name].shape or ()) for name in names}
-
-    def transform(observation: dict[str, Any]) -> F32:
-        parts = []
-        for name in names:
-            values = np.asarray(observation[name], np.float32)
-            parts.append(values.reshape(*values.shape[: values.ndim - axes[name]], -1))
-        return np.concatenate(parts, axis=-1)
-
     boxes = [before[name] for name in names]
     low = np.concatenate([box.low.ravel() for box in boxes if isinstance(box, gymnasium.spaces.Box)])
     high = np.concatenate([box.high.ravel() for box in boxes if isinstance(box, gymnasium.spaces.Box)])
-    return gymnasium.spaces.Box(low, high, dtype=np.float32), transform
+    axes = tuple((name, len(before[name].shape or ())) for name in names)
+    return gymnasium.spaces.Box(low, high, dtype=np.float32), _ToFlat(axes)
 
 
 class _Single(gymnasium.ObservationWrapper[Any, Any, Any], gymnasium.utils.RecordConstructorArgs):

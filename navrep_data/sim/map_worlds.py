@@ -102,6 +102,9 @@ class MapArrays:
             seeded=np.zeros((n, lay.RNG_WORDS), np.uint64),
         )
         self.agents, self.scalars, self.rng = self.worlds.agents, self.worlds.scalars, self.worlds.rng
+        w = self.worlds
+        # what a step changes of a world
+        self.stepped = (w.agents, w.walkers, w.contacts, w.scalars, w.place, w.own_field, w.rng, w.seeded)
         self.hits = np.zeros((n * config.robots, max(1, config.max_others)), np.int32)
         self.scans = np.zeros((n * config.robots, rays), np.float32)
         # scratch, shared by all worlds

@@ -71,6 +71,7 @@ class WorldArrays:
         self.obst_f = np.zeros((n, trees, OF_FIELDS, lay.MAX_OBSTACLE_EDGES), np.float32)
         self.obst_i = np.zeros((n, trees, OI_FIELDS, lay.MAX_OBSTACLE_EDGES), np.int32)
         self.rng = np.zeros((n, lay.RNG_WORDS), np.uint64)
+        self.stepped = (self.agents, self.scalars)  # what a step changes of a world
         # per world and robot
         self.hits = np.zeros((n * robots, max(1, config.max_others)), np.int32)
         self.scans = np.zeros((n * robots, rays), np.float32)
@@ -291,13 +292,15 @@ class Simulator:
         ):  # fmt: skip
             raise no_world(self.config)
 
-    def step(self, actions: ArrayLike) -> tuple[F64, NDArray[np.uint8]]:
-        """Advance all worlds by one time step.
+    def step(self, actions: ArrayLike, mask: ArrayLike | None = None) -> tuple[F64, NDArray[np.uint8]]:
+        """Advance all worlds, or those where `mask` (W,) is True, by one time step.
 
         Parameters
         ----------
         actions : array_like of shape (W, 3)
             Body velocity commands: vx, vy [m/s], omega [rad/s]. With R > 1 robots: (W, R, 3).
+        mask : array_like of shape (W,), optional
+            Which worlds; the others stay as they are, with reward 0 and event 0.
 
         Returns
         -------
@@ -315,13 +318,20 @@ class Simulator:
             raise ConfigError("actions hold NaN or infinity, expected finite velocities.")
         rewards = np.zeros((self.n_worlds, self.config.robots))
         events = np.zeros(self.n_worlds, np.uint8)
+        held = ~self._mask(mask)
+        # kernels step all worlds: what a step changes is put back in those that wait, which are few
+        kept = [(array, array[held]) for array in a.stepped] if held.any() else []
         if self.maps is not None:
             self.maps.step(commands.reshape(*rewards.shape, ACTION_SIZE), rewards, events)
-            return rewards.reshape(self.n_worlds, *self._per_robot), events
-        _batch.step_worlds(
-            commands.reshape(self.n_worlds, -1), a.agents, a.agents32, a.scalars, a.edges, a.polygon_start, a.boxes,
-            a.obst_f, a.obst_i, a.params, a.flags, a.orca_params, a.work_f, a.work_i, a.moves, rewards, events,
-        )  # fmt: skip
+        else:
+            _batch.step_worlds(
+                commands.reshape(self.n_worlds, -1), a.agents, a.agents32, a.scalars, a.edges, a.polygon_start,
+                a.boxes, a.obst_f, a.obst_i, a.params, a.flags, a.orca_params, a.work_f, a.work_i, a.moves, rewards,
+                events,
+            )  # fmt: skip
+        for array, rows in kept:
+            array[held] = rows
+        rewards[held], events[held] = 0.0, 0
         return rewards.reshape(self.n_worlds, *self._per_robot), events
 
     @property

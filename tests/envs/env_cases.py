@@ -6,6 +6,7 @@ import pytest
 
 from navrep_data.errors import MissingExtraError
 from navrep_data.registration import ENVIRONMENTS
+from navrep_data.schema import Event
 from navrep_data.sim import gymnasium_id, make_config
 from navrep_data.sim.maps import map_names
 
@@ -55,3 +56,20 @@ def same(a, b):
     if isinstance(a, np.ndarray):
         return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
     return type(a) is type(b) and a == b
+
+
+def labelled(infos, config):
+    """Return a vector environment's infos with the labels that a single environment's info has for codes."""
+    out = {}
+    for key, value in infos.items():
+        known = infos.get(f"_{key}")
+        if isinstance(value, dict):
+            out[key] = labelled(value, config)
+        elif key == "event":
+            out[key] = np.array([Event(v).label if k else None for v, k in zip(value, known, strict=True)], object)
+        elif key == "scenario":
+            names = [config.scenarios[v] if k else None for v, k in zip(value, known, strict=True)]
+            out[key] = np.array(names, object)
+        else:
+            out[key] = value
+    return out

@@ -3,11 +3,12 @@
 import gymnasium
 import numpy as np
 import pytest
-from env_cases import CASES, is_numbered, make, make_vec, same
+from env_cases import CASES, is_numbered, labelled, make, make_vec, param, same
 from gymnasium.vector import AutoresetMode
 
 from navrep_data.envs import NavRepEnv, NavRepVectorEnv, goal_policy
 from navrep_data.errors import ConfigError
+from navrep_data.schema import Event
 
 STEPS = 60
 
@@ -28,6 +29,7 @@ def test_equals_single_stepping_bit_for_bit(env, physics, n):
     singles = [make(env, physics=physics, time_limit=6.0, pad_humans=True) for _ in range(n)]
     plays = [90 + i for i in range(n)]
     observations, infos = vector.reset(seed=90)
+    infos = labelled(infos, vector.config)
     rng, ended = np.random.default_rng(0), 0
     first = [single.reset(seed=seed) for single, seed in zip(singles, plays, strict=True)]
     for i, (observation, info) in enumerate(first):
@@ -36,6 +38,7 @@ def test_equals_single_stepping_bit_for_bit(env, physics, n):
     for _ in range(STEPS):
         actions = actions_of(rng, vector)
         observations, rewards, terminations, truncations, infos = vector.step(actions)
+        infos = labelled(infos, vector.config)
         for i, single in enumerate(singles):
             observation, reward, terminated, truncated, info = single.step(actions[i])
             assert (rewards[i], terminations[i], truncations[i]) == (reward, terminated, truncated)
@@ -56,30 +59,93 @@ def test_equals_single_stepping_bit_for_bit(env, physics, n):
     assert ended >= n or (env.startswith("crowdmove") and physics == "original")
 
 
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
 @pytest.mark.parametrize("env", ["navrep-train", "soadrl"])
-def test_infos_are_those_of_gymnasiums_own_vector_environment(env):
-    """Keys, masks, dtypes and fillers, recursively."""
-    ours = make_vec(env, 3, time_limit=4.0)
+def test_infos_are_those_of_gymnasiums_own_vector_environment(env, mode):
+    """Keys, masks, dtypes and fillers, recursively, but for labels: strings there, codes here."""
+    ours = make_vec(env, 3, time_limit=4.0, autoreset_mode=mode)
     theirs = gymnasium.make_vec(
         "NavRepTrain-v0" if env == "navrep-train" else "SOADRL-v0",
-        num_envs=3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+        num_envs=3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode},
         pad_humans=True, time_limit=4.0,
     )  # fmt: skip
     assert ours.single_observation_space == theirs.single_observation_space
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
-    assert ours.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert ours.metadata["autoreset_mode"] is mode
     a, b = ours.reset(seed=5), theirs.reset(seed=5)
     assert same(a[0], b[0])
-    assert same(a[1], b[1])
-    rng, finals = np.random.default_rng(1), 0
+    assert same(labelled(a[1], ours.config), b[1])
+    rng, ends = np.random.default_rng(1), 0
     for _ in range(50):
         actions = rng.uniform(-1.0, 1.0, (3, 3)).astype(np.float32)
         a, b = ours.step(actions), theirs.step(actions)
-        finals += "final_obs" in a[4]
-        for x, y in zip(a, b, strict=True):
+        ends += int((a[2] | a[3]).sum())
+        assert ("final_obs" in a[4]) == ((a[2] | a[3]).any() and mode is AutoresetMode.SAME_STEP)
+        for x, y in zip(a[:4], b[:4], strict=True):
             assert same(x, y)
-    assert finals > 0
+        assert same(labelled(a[4], ours.config), b[4])
+    assert ends > 2
+
+
+@pytest.mark.parametrize("env", ["navrep-train", "navrep-test", param("ian")])
+def test_episodes_are_the_same_in_every_autoreset_mode(env):
+    modes = ["SameStep", "NextStep", "Disabled"]
+    starts = {}
+    for mode in modes:
+        vector = make_vec(env, 3, autoreset_mode=mode, time_limit=2.0)
+        observations, _ = vector.reset(seed=11)
+        found = [[row.tobytes()] for row in observations["robot_state"]]
+        actions, waiting = np.full((3, 3), 0.4), np.zeros(3, bool)
+        for _ in range(36):
+            observations, _, terminations, truncations, infos = vector.step(actions)
+            done = terminations | truncations
+            fresh = waiting if mode == "NextStep" else done
+            if mode == "Disabled" and done.any():
+                with pytest.raises(gymnasium.error.ResetNeeded, match=r"have ended: call reset\(options="):
+                    vector.step(actions)
+                observations, infos = vector.reset(options={"reset_mask": done})
+            for i in np.flatnonzero(fresh):
+                found[i].append(observations["robot_state"][i].tobytes())
+            assert infos["event"].dtype == np.uint8
+            assert (infos["event"][fresh] == 0).all()
+            waiting = done
+        starts[mode] = [one[:3] for one in found]
+    assert all(len(one) == 3 for one in starts["NextStep"])
+    assert starts["SameStep"] == starts["NextStep"] == starts["Disabled"]
+
+
+def test_a_world_that_waits_is_left_alone():
+    """In NEXT_STEP mode an episode ends on other steps in each world; the others' steps do not move it."""
+    vector = make_vec("soadrl", 4, autoreset_mode="NextStep", time_limit=3.0)
+    singles = [make("soadrl", pad_humans=True, time_limit=3.0) for _ in range(4)]
+    vector.reset(seed=3)
+    for i, single in enumerate(singles):
+        single.reset(seed=3 + i)
+    rng, waiting = np.random.default_rng(2), np.zeros(4, bool)
+    for _ in range(40):
+        actions = rng.uniform(-1.0, 1.0, (4, 3))
+        observations, rewards, terminations, truncations, _ = vector.step(actions)
+        for i, single in enumerate(singles):
+            if waiting[i]:
+                expected = (single.reset()[0], 0.0, False, False)
+            else:
+                expected = single.step(actions[i])[:4]
+            assert same({k: v[i] for k, v in observations.items()}, expected[0])
+            assert (rewards[i], terminations[i], truncations[i]) == expected[1:]
+        waiting = terminations | truncations
+
+
+def test_episodes_can_be_cut_after_some_steps():
+    vector = make_vec("navrep-test", 2, max_episode_steps=3, humans=0, obstacles=0)
+    assert vector.spec.max_episode_steps == 3
+    vector.reset(seed=0)
+    events = []
+    for _ in range(6):
+        _, _, terminations, truncations, infos = vector.step(np.zeros((2, 3)))
+        assert not terminations.any()
+        events.append(infos["final_info"]["event"].tolist() if truncations.any() else None)
+    assert events == [None, None, [Event.CUT] * 2] * 2
 
 
 def test_numbered_episodes_are_shared_out_and_wrap():
@@ -90,7 +156,7 @@ def test_numbered_episodes_are_shared_out_and_wrap():
     for _ in range(8):
         infos = env.step(np.zeros((3, 3)))[4]
         if "final_info" in infos:
-            assert infos["final_info"]["event"].tolist() == ["timeout"] * 3
+            assert infos["final_info"]["event"].tolist() == [Event.TIMEOUT] * 3
             assert infos["final_info"]["seed"].tolist() == seen[-1].tolist()
             seen.append(infos["seed"])
     assert [s.tolist() for s in seen[1:3]] == [[1002, 1003, 1004], [1005, 1006, 1007]]
@@ -155,4 +221,8 @@ def test_wrong_calls_say_so_in_one_line():
         NavRepVectorEnv(2, "navrep-test", render_mode="human")
     with pytest.raises(ConfigError, match="n_worlds is 0"):
         NavRepVectorEnv(0)
+    with pytest.raises(ConfigError, match=r"autoreset_mode is 'NextSteps', expected one of: .*mean 'NextStep'"):
+        NavRepVectorEnv(1, autoreset_mode="NextSteps")
+    with pytest.raises(ConfigError, match="max_episode_steps is 0, expected a whole number of at least 1"):
+        NavRepVectorEnv(1, max_episode_steps=0)
     assert "navrep-test" in str(env) or "num_envs=2" in str(env)
