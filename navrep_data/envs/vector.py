@@ -37,7 +37,8 @@ def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
     except ValueError:
         known = [known.value for known in AutoresetMode]
         raise ConfigError(
-            f"autoreset_mode is {str(mode)[:40]!r}, expected one of: {', '.join(known)}.{did_you_mean(str(mode), known)}"
+            f"autoreset_mode is {str(mode)[:40]!r}, expected one of: {', '.join(known)}."
+            f"{did_you_mean(str(mode), known)}"
         ) from None
 
 
