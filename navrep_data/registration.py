@@ -29,9 +29,21 @@ ENVIRONMENTS = (
 """Names of the environments, as in :func:`navrep_data.sim.environment_names`; listed here because that loads numba."""
 
 
+_SQUASHED = {name.replace("-", ""): name for name in ENVIRONMENTS}
+
+
 def camel_case(name: str) -> str:
     """Return a kebab-case name in CamelCase, as gymnasium spells ids: ``mark-train-1`` -> ``MarkTrain1``."""
     return "".join(_SPELLED.get(word, word.capitalize()) for word in name.split("-"))
+
+
+def environment_of(name: str) -> str:
+    """Return an environment's name however it is spelt: ``NavRepTest-v0``, ``navreptest`` -> ``navrep-test``.
+
+    A name that is none is returned as it is.
+    """
+    bare = name.rpartition(":")[2].removesuffix(f"-v{VERSION}")
+    return _SQUASHED.get(bare.replace("-", "").replace("_", "").lower(), name)
 
 
 def register() -> None:

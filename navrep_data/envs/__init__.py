@@ -1,5 +1,7 @@
 """Gymnasium environments over the simulator, single and vectorised (gymnasium and numpy, no torch)."""
 
+from typing import Any
+
 from navrep_data.envs.playing import play
 from navrep_data.envs.recording import Recording, goal_policy, record
 from navrep_data.envs.single import NavRepEnv
@@ -18,6 +20,7 @@ from navrep_data.sim import gymnasium_id
 __all__ = [
     "FlatObservation",
     "NavRepEnv",
+    "NavRepSB3VecEnv",
     "NavRepVectorEnv",
     "Recording",
     "RingsObservation",
@@ -27,9 +30,22 @@ __all__ = [
     "VectorScan1dObservation",
     "goal_policy",
     "gymnasium_id",
+    "make_sb3_vec",
     "play",
     "record",
     "register",
 ]
+
+_WITH_SB3 = ("NavRepSB3VecEnv", "make_sb3_vec")
+
+
+def __getattr__(name: str) -> Any:
+    """Load what needs stable-baselines3 when it is asked for: with it comes torch."""
+    if name not in _WITH_SB3:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from navrep_data.envs import sb3
+
+    return getattr(sb3, name)
+
 
 register()

@@ -25,7 +25,7 @@ from navrep_data.envs.worlds import (
 )
 from navrep_data.errors import ConfigError, did_you_mean
 from navrep_data.schema import Event
-from navrep_data.sim import SimConfig
+from navrep_data.sim import SimConfig, WorldState
 from navrep_data.sim.raster import Camera, draw_frame
 
 Infos = dict[str, Any]
@@ -296,12 +296,35 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
             return None
         if self._scans is None:
             raise gymnasium.error.ResetNeeded("There is nothing to draw before the first reset().")
-        return tuple(self._frame(i) for i in range(self.num_envs))
+        return tuple(self.frame(i) for i in range(self.num_envs))
 
-    def _frame(self, i: int) -> NDArray[np.uint8]:
-        assert self._scans is not None
-        state, grid = self._worlds.sim.state(i), self._worlds.grid(i)
-        camera = self._cameras[i]
-        if camera is None:
-            camera = self._cameras[i] = Camera.around(state, grid)
-        return draw_frame(state, camera, self._scans[i], self.config.sensor, self._trails[i], grid)
+    def frame(self, world: int, size: int = 480) -> NDArray[np.uint8]:
+        """Return a picture of one world as it is now, whatever the render mode; the trail is kept in ``"rgb_array"``.
+
+        Parameters
+        ----------
+        world : int
+            Which.
+        size : int
+            Width and height [pixels].
+
+        Returns
+        -------
+        ndarray of shape (size, size, 3), uint8
+            As :meth:`NavRepEnv.frame`.
+        """
+        if not self._running:
+            raise gymnasium.error.ResetNeeded("There is nothing to draw before the first reset().")
+        state, grid = self._worlds.sim.state(world), self._worlds.grid(world)
+        if self._scans is not None:
+            scan = self._scans[world]
+        else:
+            scan = self._worlds.observe(np.arange(self.num_envs) == world)["scan"][world]
+        camera = self._cameras[world]
+        if camera is None or self.render_mode is None:
+            camera = self._cameras[world] = Camera.around(state, grid)
+        return draw_frame(state, camera, scan, self.config.sensor, self._trails[world], grid, size)
+
+    def state(self, world: int) -> WorldState:
+        """Return a copy of one world's state, see :class:`navrep_data.sim.WorldState`."""
+        return self._worlds.sim.state(world)
