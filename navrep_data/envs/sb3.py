@@ -154,7 +154,8 @@ class NavRepSB3VecEnv(WorldBatch):
             raise ConfigError(
                 f"robots is {base.config.robots}, expected 1: stable-baselines3 knows one action per world."
             )
-        self.env, self._base = env, base
+        self.env: Any = env
+        self._base = base
         self._actions: Any = None
         shared = {"config": base.config, "render_mode": base.render_mode, "spec": base.spec, "metadata": base.metadata}
         super().__init__(base.num_envs, env.single_observation_space, env.single_action_space, shared)
@@ -182,9 +183,9 @@ class NavRepSB3VecEnv(WorldBatch):
         infos = fresh
         if done.any():
             infos, last = list(fresh), self._each(vector_infos["final_info"])
-            for i in np.flatnonzero(done):
-                self.reset_infos[i] = fresh[i]
-                infos[i] = {**last[i], "terminal_observation": vector_infos["final_obs"][i]}
+            for over in np.flatnonzero(done).tolist():
+                self.reset_infos[over] = fresh[over]
+                infos[over] = {**last[over], "terminal_observation": vector_infos["final_obs"][over]}
         for i, info in enumerate(infos):
             info["TimeLimit.truncated"] = bool(truncations[i] and not terminations[i])
         return observations, rewards.astype(np.float32), done, infos

@@ -12,10 +12,9 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
-from navrep_data.errors import SimulationError
+from navrep_data.envs.sb3 import WorldBatch
 from navrep_data.models.controllers import N_ACTIONS
 from navrep_data.schema import ACTION_SIZE, Event
 from navrep_data.sim import SimConfig, Simulator
@@ -36,29 +35,6 @@ def shorten(actions: F32, max_speed: float) -> F32:
 def _distance(state: F32) -> NDArray[np.float64]:
     """Return the distances (W,) [m] to the goals of robot states (W, 5)."""
     return np.hypot(state[:, 0].astype(np.float64), state[:, 1].astype(np.float64))
-
-
-class _Batch(VecEnv):
-    """What VecEnv asks for beside steps, for worlds that are nothing by themselves."""
-
-    def close(self) -> None:
-        """Nothing is open."""
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute for each of the worlds asked for; they share it."""
-        return [getattr(self, attr_name, None)] * len(list(self._get_indices(indices)))
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse: worlds have no attributes of their own."""
-        raise SimulationError(f"{attr_name!r} cannot be set for single worlds of a batch.")
-
-    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Refuse: worlds have no methods of their own."""
-        raise SimulationError(f"{method_name!r} cannot be called on single worlds of a batch.")
-
-    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Return False for each world asked for: the statistics are those of the simulator."""
-        return [False] * len(list(self._get_indices(indices)))
 
 
 class Stepped(NamedTuple):
@@ -86,7 +62,7 @@ class Stepped(NamedTuple):
     ends: F32
 
 
-class TrainingWorlds(_Batch):
+class TrainingWorlds(WorldBatch):
     """Worlds of one environment, seen through a policy's encoder and memory.
 
     Parameters
@@ -142,6 +118,7 @@ class TrainingWorlds(_Batch):
             n_worlds,
             spaces.Box(-np.inf, np.inf, (policy.n_inputs,), np.float32),
             spaces.Box(-1.0, 1.0, (N_ACTIONS,), np.float32),
+            {"config": config},
         )
 
     def reset(self) -> F32:
@@ -235,7 +212,7 @@ class TrainingWorlds(_Batch):
         return events
 
 
-class WorldGroups(_Batch):
+class WorldGroups(WorldBatch):
     """Training worlds in groups that step and encode at the same time, each in a thread of its own.
 
     Parameters
@@ -259,7 +236,7 @@ class WorldGroups(_Batch):
         self._slices = [slice(first, stop) for first, stop in pairwise(firsts)]
         self._pool = ThreadPoolExecutor(n_groups, "navrep-data-worlds", lambda: torch.set_num_threads(1))
         first = self.groups[0]
-        super().__init__(n_worlds, first.observation_space, first.action_space)
+        super().__init__(n_worlds, first.observation_space, first.action_space, {"config": first.config})
 
     def each(self, work: Callable[[TrainingWorlds, slice], Any]) -> list[Any]:
         """Do something with every group and its worlds' slice, side by side; each on one thread of torch's."""
