@@ -12,6 +12,7 @@ from navrep_data.errors import ConfigError, NavrepDataError
 
 if TYPE_CHECKING:
     from navrep_data.zoo import Report
+    from navrep_data.zoo.verification import Check
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 From = Annotated[
@@ -137,12 +138,12 @@ def verify_command(
     name: Name = None,
     every: All = False,
     golden: Annotated[
-        Path | None, typer.Option("--golden", metavar="DIR", help="Outputs of the original software to compare.")
+        Path | None, typer.Option("--golden", metavar="DIR", help="More outputs of the original software to compare.")
     ] = None,
     source: From = None,
     as_json: Json = False,
 ) -> None:
-    """Check hashes, load each checkpoint, compare golden outputs. Asks no network.
+    """Check hashes, load each checkpoint, compare its outputs with recorded ones. Asks no network.
 
     Exits 1 if anything is wrong, or if a checkpoint asked for by name is missing; with --all what is missing is listed.
     """
@@ -163,28 +164,39 @@ def verify_command(
     if as_json:
         print_json(report.to_dict())
     else:
-        for line in _report_lines(report, golden is not None):
+        for line in _report_lines(report):
             say(line)
     if not report.ok or (not every and report.having("missing")):
         raise typer.Exit(1)
 
 
-def _report_lines(report: Report, compared: bool) -> list[str]:
+def _report_lines(report: Report) -> list[str]:
     from navrep_data.zoo.registry import dependants, records
 
     lines = []
     for check in report.checks:
-        golden = f", {len(check.comparisons)} golden outputs" if check.comparisons else ""
-        lines.append(f"{check.status:8}{check.name}{golden}")
+        lines.append(f"{check.status:8}{check.name}{_compared(check)}")
         for problem in check.problems:
             waiting = len(dependants(records()[check.name])) if check.status == "missing" else 0
             lines.append(f"        {problem}" + (f"; {waiting} policies need it" if waiting else ""))
         lines += [f"        {name} is not in the golden folder" for name in check.not_compared]
     ok, missing, wrong = (len(report.having(status)) for status in ("ok", "missing", "wrong"))
     outputs = [c for check in report.checks for c in check.comparisons]
-    end = f"; {sum(c.ok for c in outputs)} of {len(outputs)} golden outputs within tolerance" if compared else ""
+    end = f"; {sum(c.ok for c in outputs)} of {len(outputs)} golden outputs within tolerance" if outputs else ""
     lines.append(f"{len(report.checks)} checkpoints: {ok} right, {missing} missing, {wrong} wrong{end}")
     return lines + _depend_lines(report)
+
+
+def _compared(check: Check) -> str:
+    """Say how many outputs were compared, and whose."""
+    outputs = [c for c in check.comparisons if not c.output.startswith("weights")]
+    theirs = sum(c.original for c in outputs)
+    ours = len(outputs) - theirs
+    if check.status != "ok":
+        return ""
+    said = f", {theirs} outputs of the original software" if theirs else ""
+    said += f", {ours} outputs that navrep-data recorded" if ours else ""
+    return said or ", no outputs of it are known"
 
 
 def _depend_lines(report: Report) -> list[str]:

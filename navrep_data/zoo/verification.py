@@ -2,8 +2,9 @@
 
 Notes
 -----
-Golden files hold outputs of TensorFlow 1.13, stable-baselines 2.10 and the authors' torch classes. Verification reads
-what is on this machine and never asks the network.
+Golden files hold outputs of TensorFlow 1.13, stable-baselines 2.10 and the authors' torch classes. The package has a
+few rows of them (:mod:`navrep_data.zoo.golden`), and outputs of its own for checkpoints of which there is nothing else.
+Verification reads what is on this machine and never asks the network.
 """
 
 from __future__ import annotations
@@ -34,12 +35,16 @@ class Comparison:
         Golden file and what was compared.
     error, tolerance : float
         Largest absolute difference, and the largest allowed.
+    original : bool
+        Whether the original software computed the golden output; this package did otherwise, when the checkpoint was
+        added to it.
     """
 
     file: str
     output: str
     error: float
     tolerance: float
+    original: bool = True
 
     @property
     def ok(self) -> bool:
@@ -115,14 +120,14 @@ def verify(
     source: str | os.PathLike[str] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Report:
-    """Check hashes of checkpoints, load them, and compare golden outputs.
+    """Check hashes of checkpoints, load them, and compare their outputs with those that the package holds.
 
     Parameters
     ----------
     pattern : str
         Name, variant or wildcards; default all.
     golden : path-like, optional
-        Folder with golden outputs of the original software.
+        Folder with more golden outputs of the original software, which are compared, too.
     source : path-like or str, optional
         Folder with the authors' files, looked in before the cache.
     progress : callable, optional
@@ -186,6 +191,7 @@ def _check(record: Record, where: Source, golden: Path | None) -> Check:
     absent: list[str] = []
     try:
         module = open_alone(record, path)
+        comparisons += compare_compact(record, module)
         for name in record.golden if golden is not None else ():
             assert golden is not None
             if (golden / name).is_file():
@@ -259,6 +265,32 @@ def _compare(record: Record, module: Any, path: Path, where: Source, needs: tupl
     else:
         outputs = outputs_of.world_model_outputs(module, arrays)
     return [Comparison(path.name, *output) for output in outputs]
+
+
+def compare_compact(record: Record, module: Any) -> list[Comparison]:
+    """Compare a network's outputs with the few that the package holds of it.
+
+    Parameters
+    ----------
+    record : Record
+        Which checkpoint.
+    module : torch.nn.Module
+        Its network, as :func:`open_alone` gives it.
+    """
+    from navrep_data.zoo import golden as outputs_of
+
+    path = outputs_of.COMPACT / f"{record.name}.npz"
+    if not path.is_file():
+        return []
+    arrays = _arrays(path)
+    if record.kind == "vae":
+        outputs = outputs_of.vae_outputs(module, arrays, compact=True)
+    elif record.kind == "world_model":
+        outputs = outputs_of.world_model_outputs(module, arrays, compact=True)
+    else:
+        outputs = outputs_of.controller_outputs(module, arrays)
+    found = [Comparison(path.name, *output, bool(arrays["original"])) for output in outputs]
+    return [*found, Comparison(path.name, *outputs_of.weights_output(module, arrays), False)]
 
 
 def _arrays(path: Path) -> dict[str, Any]:
