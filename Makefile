@@ -56,7 +56,7 @@ kill-test: $(STAMP)  ## 200 random SIGKILLs of generate (CI runs 10).
 # seconds in all; FUZZ_ARGS="--only shard map" for some readers, --seed N to see a finding again
 SECONDS ?= 600
 
-fuzz: $(STAMP)  ## Fuzz every reader of files from outside for SECONDS=600 (CI: 60).
+fuzz: $(STAMP)  ## Fuzz every reader of files from outside for SECONDS=600, with a fresh seed.
 	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(FUZZ_ARGS)
 
 BENCHMARKS := run zoo envs scale training
