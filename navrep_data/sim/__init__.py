@@ -15,7 +15,7 @@ from navrep_data.sim.rollout import (
     SequenceRows,
 )
 from navrep_data.sim.scenarios import MAP_GROUPS, Scenario, get_scenario, scenario_names
-from navrep_data.sim.simulator import Simulator, WorldState, check_seed, warm_up
+from navrep_data.sim.simulator import Simulator, Touches, WorldState, check_seed, warm_up
 
 __all__ = [
     "MAP_GROUPS",
@@ -32,6 +32,7 @@ __all__ = [
     "SequenceRows",
     "SimConfig",
     "Simulator",
+    "Touches",
     "WorldState",
     "check_seed",
     "describe_environment",

@@ -75,7 +75,7 @@ from navrep_data.sim._ian_motion import (
 )
 from navrep_data.sim._ian_orca import choose_orca
 from navrep_data.sim._ian_plan import at_goal, follow_tasks, give_tasks, limit_command
-from navrep_data.sim._judge import COLLISION_HUMAN, COLLISION_OBSTACLE, GOAL, NONE, TIMEOUT
+from navrep_data.sim._judge import COLLISION_HUMAN, COLLISION_OBSTACLE, GOAL, NONE, TIMEOUT, note_touch
 from navrep_data.sim._layout import (
     A_CLEAR_HUMAN,
     A_CLEAR_STATIC,
@@ -166,12 +166,22 @@ def _hits_wall(agents, walkers, i, maps, map_row, rules):
 
 
 @kernel
+def _note_touches(agents, circles, n):
+    """Write which other agents the first robot touches, before anybody is put back; a robot's pairs never pass."""
+    for j in range(1, n):
+        vx, vy = agents[j, A_VX] - agents[0, A_VX], agents[j, A_VY] - agents[0, A_VY]
+        note_touch(agents, j, touches(agents, circles, 0, j), vx, vy)
+
+
+@kernel
 def _collide(agents, walkers, contacts, circles, n, maps, map_row, rules):
     """Find the step's collisions in the original's order; those who collide take damage and are put back.
 
-    For each agent in turn: the first other of a higher number whose body it touches, then static matter.
+    For each agent in turn: the first other of a higher number whose body it touches, then static matter. The map's edge
+    counts as static matter for what the first robot touches.
     """
     robots = int(rules[R_ROBOTS])
+    _note_touches(agents, circles, n)
     for i in range(n):
         walkers[i, W_HIT] = NONE
     for i in range(n):
@@ -186,7 +196,10 @@ def _collide(agents, walkers, contacts, circles, n, maps, map_row, rules):
                 put_back(agents, walkers, i)
                 put_back(agents, walkers, j)
             break
-        if _hits_wall(agents, walkers, i, maps, map_row, rules):
+        wall = _hits_wall(agents, walkers, i, maps, map_row, rules)
+        if i == 0:
+            note_touch(agents, 0, wall or walkers[0, W_LEFT] != 0.0, agents[0, A_VX], agents[0, A_VY])
+        if wall:
             damage = np.hypot(agents[i, A_VX], agents[i, A_VY])
             walkers[i, W_DAMAGE] += damage
             walkers[i, W_DAMAGE_STATIC] += damage

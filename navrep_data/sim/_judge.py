@@ -19,6 +19,8 @@ from navrep_data.sim._layout import (
     A_HIT,
     A_RADIUS,
     A_TAKEN,
+    A_TOUCH_SPEED,
+    A_TOUCHED,
     A_X,
     A_Y,
     F_DAMAGE,
@@ -78,6 +80,13 @@ def measure(r, agents, n_agents, scalars, edges, polygon_start, moves, dt):
     x1, y1 = x0 + moves[r, 0] * dt, y0 + moves[r, 1] * dt
     to_static = swept_clearance(x0, y0, x1, y1, edges, polygon_start, int(scalars[S_POLYGONS]))
     agents[r, A_CLEAR_STATIC] = to_static - agents[r, A_RADIUS]
+
+
+@kernel
+def note_touch(agents, j, touched, vx, vy):
+    """Write whether the first robot touches agent j (0: static matter), moving against it with (vx, vy) [m/s]."""
+    agents[j, A_TOUCHED] = 1.0 if touched else 0.0
+    agents[j, A_TOUCH_SPEED] = np.hypot(vx, vy) if touched else 0.0
 
 
 @kernel

@@ -30,7 +30,10 @@ A_CLEAR_STATIC = 20  # smallest gap to an obstacle during the last step [m]
 # scratch of a step
 A_HIT = 21  # the collision's event where this agent is put back
 A_TAKEN = 22  # damage taken [m/s]
-AGENT_FIELDS = 23
+# all agents: what the first robot touched in the last step, by the rule that decides collisions; row 0: static matter
+A_TOUCHED = 23  # 1 where it did
+A_TOUCH_SPEED = 24  # how fast they moved against each other then [m/s]; row 0: the robot's own speed
+AGENT_FIELDS = 25
 
 # --- scalars (SCALAR_FIELDS,) float64, per world --------------------------------------------------------------------
 S_TIME = 0  # simulated time since reset [s]

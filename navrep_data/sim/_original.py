@@ -11,7 +11,7 @@ import numpy as np
 
 from navrep_data._kernels import kernel
 from navrep_data.sim._geometry import point_segment_sq
-from navrep_data.sim._judge import COLLISION_HUMAN, COLLISION_OBSTACLE, GOAL, NONE, TIMEOUT, reach_of_goal
+from navrep_data.sim._judge import COLLISION_HUMAN, COLLISION_OBSTACLE, GOAL, NONE, TIMEOUT, note_touch, reach_of_goal
 from navrep_data.sim._layout import (
     A_GAIT_T,
     A_GAIT_X,
@@ -284,7 +284,10 @@ def window_hits(boxes, n_boxes, x, y, half):
 
 @kernel
 def _nearest_human(agents, n_humans, moves, dt):
-    """Return the smallest gap to a human during the step, humans going on at their old velocity [m]."""
+    """Return the smallest gap to a human during the step, humans going on at their old velocity [m].
+
+    Also notes whom the robot touches.
+    """
     best = np.inf
     for j in range(1, n_humans + 1):
         rx = agents[j, A_X] - agents[0, A_X]
@@ -292,6 +295,7 @@ def _nearest_human(agents, n_humans, moves, dt):
         ex = rx + (agents[j, A_VX] - moves[0, 0]) * dt
         ey = ry + (agents[j, A_VY] - moves[0, 1]) * dt
         gap = np.sqrt(point_segment_sq(0.0, 0.0, rx, ry, ex, ey)) - agents[j, A_RADIUS] - agents[0, A_RADIUS]
+        note_touch(agents, j, gap < 0.0, agents[j, A_VX] - moves[0, 0], agents[j, A_VY] - moves[0, 1])
         best = min(best, gap)
     return best
 
@@ -320,6 +324,9 @@ def judge_original(agents, scalars, boxes, moves, params, result):
         or y <= scalars[S_YMIN] + radius
         or y >= scalars[S_YMAX] - radius
     )
+    # looked at whatever decides: the goal outranks a collision, which is a contact all the same
+    at_wall = at_border or window_hits(boxes, n_boxes, x, y, int(np.ceil(radius / np.sqrt(2.0) / CELL)))
+    note_touch(agents, 0, at_wall, moves[0, 0], moves[0, 1])
     event = NONE
     reward = 0.0
     if scalars[S_TIME] >= params[P_TIME_LIMIT]:
@@ -330,7 +337,7 @@ def judge_original(agents, scalars, boxes, moves, params, result):
     elif to_human < 0.0:
         event = COLLISION_HUMAN
         reward = params[P_REWARD_COLLISION]
-    elif at_border or window_hits(boxes, n_boxes, x, y, int(np.ceil(radius / np.sqrt(2.0) / CELL))):
+    elif at_wall:
         event = COLLISION_OBSTACLE
         reward = params[P_REWARD_COLLISION]
     else:

@@ -5,11 +5,12 @@ import numpy as np
 
 from navrep_data._kernels import kernel
 from navrep_data.sim._geometry import swept_clearance
-from navrep_data.sim._judge import COLLISION_HUMAN, COLLISION_OBSTACLE, GOAL, NONE, TIMEOUT, agent_gap
+from navrep_data.sim._judge import COLLISION_HUMAN, COLLISION_OBSTACLE, GOAL, NONE, TIMEOUT, agent_gap, note_touch
 from navrep_data.sim._layout import (
     A_AOMEGA,
     A_AX,
     A_AY,
+    A_CLEAR_HUMAN,
     A_CLEAR_STATIC,
     A_DAMAGE,
     A_GAIT_X,
@@ -85,6 +86,39 @@ def go_on(r, before, agents, params, flags, commands, moves):
 
 
 @kernel
+def _nears_obstacle(r, agents, scalars, edges, polygon_start):
+    """Return whether robot r, whose gap is measured, overlaps an obstacle more than it did before the step."""
+    if agents[r, A_CLEAR_STATIC] >= 0.0:
+        return False
+    x, y = agents[r, A_X], agents[r, A_Y]
+    at_start = swept_clearance(x, y, x, y, edges, polygon_start, int(scalars[S_POLYGONS]))
+    return agents[r, A_CLEAR_STATIC] < at_start - agents[r, A_RADIUS]
+
+
+@kernel
+def _nears_agent(r, j, agents, moves, dt):
+    """Return whether robot r and agent j overlap during a step more than before it."""
+    gap = agent_gap(r, j, agents, moves, dt)
+    return gap < 0.0 and gap < agent_gap(r, j, agents, moves, 0.0)
+
+
+@kernel
+def note_touches(agents, n_agents, scalars, edges, polygon_start, moves, dt, damage):
+    """Write what the first robot touches in a step that is measured and not yet made, by the rules of collisions."""
+    near = agents[0, A_CLEAR_HUMAN] < 0.0
+    for j in range(1, n_agents):
+        touched = False
+        if near:
+            touched = _nears_agent(0, j, agents, moves, dt) if damage else agent_gap(0, j, agents, moves, dt) < 0.0
+        note_touch(agents, j, touched, moves[j, 0] - moves[0, 0], moves[j, 1] - moves[0, 1])
+    if damage:
+        touched = _nears_obstacle(0, agents, scalars, edges, polygon_start)
+    else:
+        touched = agents[0, A_CLEAR_STATIC] < 0.0
+    note_touch(agents, 0, touched, moves[0, 0], moves[0, 1])
+
+
+@kernel
 def put_back(agents, n_robots, n_agents, scalars, edges, polygon_start, moves, dt):
     """Let everybody who would collide with a robot, and the robot, stay; robots take damage by their own speed.
 
@@ -95,14 +129,10 @@ def put_back(agents, n_robots, n_agents, scalars, edges, polygon_start, moves, d
         agents[i, A_HIT] = NONE
     for r in range(n_robots):
         agents[r, A_TAKEN] = 0.0
-        if agents[r, A_CLEAR_STATIC] < 0.0:
-            x, y = agents[r, A_X], agents[r, A_Y]
-            at_start = swept_clearance(x, y, x, y, edges, polygon_start, int(scalars[S_POLYGONS]))
-            if agents[r, A_CLEAR_STATIC] < at_start - agents[r, A_RADIUS]:
-                agents[r, A_HIT] = COLLISION_OBSTACLE
+        if _nears_obstacle(r, agents, scalars, edges, polygon_start):
+            agents[r, A_HIT] = COLLISION_OBSTACLE
         for j in range(r + 1, n_agents):
-            gap = agent_gap(r, j, agents, moves, dt)
-            if gap < 0.0 and gap < agent_gap(r, j, agents, moves, 0.0):
+            if _nears_agent(r, j, agents, moves, dt):
                 agents[r, A_HIT] = COLLISION_HUMAN
                 agents[j, A_HIT] = COLLISION_HUMAN
     for i in range(n_agents):

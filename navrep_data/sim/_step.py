@@ -68,7 +68,7 @@ from navrep_data.sim._obstacles import build_obstacles
 from navrep_data.sim._orca import orca_velocity
 from navrep_data.sim._original import draw_original, judge_original, walk_original
 from navrep_data.sim._rng import is_mersenne
-from navrep_data.sim._robots import first_event, go_on, put_back
+from navrep_data.sim._robots import first_event, go_on, note_touches, put_back
 from navrep_data.sim._worlds import add_border, draw_world
 
 # orca.py of the original: agents enter RVO2 with their radius plus 1 cm
@@ -307,6 +307,7 @@ def step_world(
     else:
         for r in range(robots):
             measure(r, agents, stop, scalars, edges, polygon_start, moves, dt)
+        note_touches(agents, stop, scalars, edges, polygon_start, moves, dt, flags[F_DAMAGE] != 0)
         if flags[F_DAMAGE]:
             put_back(agents, robots, stop, scalars, edges, polygon_start, moves, dt)
         for r in range(robots):

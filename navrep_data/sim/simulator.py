@@ -116,6 +116,31 @@ class WorldState:
     ellipses: F64
 
 
+@dataclass(frozen=True)
+class Touches:
+    """What the first robots touched during the last step; everything 0 and False right after a reset.
+
+    A touch is what the rule of the world's collisions takes for one, whether it ends the episode, does damage, or is
+    outranked by the goal. Matter means walls, obstacles, the border of the world and the edge of a map.
+
+    Attributes
+    ----------
+    agents : ndarray of shape (W, N - 1), bool
+        Whether it touched each other agent: the other robots, then the humans; False in empty slots.
+    agent_speeds : ndarray of shape (W, N - 1)
+        Norm of the difference of both velocities then [m/s]; 0 without a touch.
+    matter : ndarray of shape (W,), bool
+        Whether it touched static matter.
+    matter_speeds : ndarray of shape (W,)
+        The robot's own speed then [m/s]; 0 without a touch.
+    """
+
+    agents: NDArray[np.bool_]
+    agent_speeds: F64
+    matter: NDArray[np.bool_]
+    matter_speeds: F64
+
+
 class Simulator:
     """A batch of independent worlds that step together.
 
@@ -390,6 +415,15 @@ class Simulator:
         """Return the damage that each robot has taken since reset, (W, R) [m/s]; 0 unless ``on_collision="damage"``."""
         taken: F64 = self.arrays.agents[:, : self.config.robots, lay.A_DAMAGE].copy()
         return taken
+
+    def touches(self) -> Touches:
+        """Return whom and what the first robots touched during the last step."""
+        agents = self.arrays.agents
+        there = self.config.robots + self.arrays.scalars[:, lay.S_HUMANS]
+        # what stands in the rows beyond is left from worlds with more humans
+        touched = (agents[:, :, lay.A_TOUCHED] > 0.0) & (np.arange(agents.shape[1]) < there[:, None])
+        speeds = np.where(touched, agents[:, :, lay.A_TOUCH_SPEED], 0.0)
+        return Touches(touched[:, 1:], speeds[:, 1:], touched[:, 0], speeds[:, 0])
 
     def difficulty(self) -> NDArray[np.int64]:
         """Return the present setting of `humans` and `obstacles` in each world, (W, 2): what the curriculum adapts."""
