@@ -17,7 +17,18 @@ ROOT = DOCS.parent
 # page -> pages below it; those without a source are left out
 NAVIGATION = {
     "index": ["tour", "guide", "reference", "api/index"],
-    "guide": ["datasets", "tools", "environments", "zoo", "benchmark", "training", "robot", "scale", "examples"],
+    "guide": [
+        "datasets",
+        "tools",
+        "environments",
+        "zoo",
+        "benchmark",
+        "experiments",
+        "training",
+        "robot",
+        "scale",
+        "examples",
+    ],
     "reference": ["differences", "format", "promises", "measurements", "security", "changelog", "contributing"],
     "api/index": [
         f"api/{name}"

@@ -31,6 +31,10 @@ def benchmark_command(
         int | None,
         typer.Option("--episodes", help="Episodes per scenario.", show_default="navreptest 200, navrep27 300"),
     ] = None,
+    first_round: Annotated[
+        int,
+        typer.Option("--first-round", help="First round: later episodes, results in DIR/SUITE-PHYSICS-roundR."),
+    ] = 0,
     workers: Annotated[
         int | None,
         typer.Option("--workers", help="Processes; numbers do not depend on it.", show_default="1; on Ray all"),
@@ -103,6 +107,7 @@ def benchmark_command(
                 progress=bars,
                 ranges=ranges,
                 scaling=scaling,
+                first_round=first_round,
             )
     if as_json:
         print_json(report.to_dict())
@@ -113,13 +118,14 @@ def benchmark_command(
 
 
 def _short(report: Any) -> str:
-    """Return what a terminal shows: shares, runs of variants, maps."""
+    """Return what a terminal shows: shares, runs of variants, maps, pairs."""
     from navrep_data.evaluate import tables
 
     parts = [
         tables.overall(report.rows, report.baseline),
         tables.variants(report.variants, report.rows, report.baseline),
         tables.per_part(report.rows, report.baseline, "per_map"),
+        tables.paired(report.pairs),
     ]
     return "\n\n".join(part for part in parts if part)
 

@@ -17,7 +17,7 @@ from navrep_data.evaluate.executors import Job, run, run_on_ray
 from navrep_data.evaluate.policies import NETWORKS, PilotSpec, resolve_policy
 from navrep_data.evaluate.results import Results, file_name, header_of, open_results
 from navrep_data.evaluate.runner import Episode
-from navrep_data.evaluate.scores import by_variant, summary
+from navrep_data.evaluate.scores import by_variant, compare, summary
 from navrep_data.evaluate.suites import Suite, get_suite
 from navrep_data.generate.executors import EXECUTORS
 from navrep_data.io import atomic_write_bytes, translate_os_error
@@ -43,6 +43,8 @@ class Benchmark:
         Variants of which several runs were played.
     baseline : dict
         The row of `goal`, asked for or not.
+    pairs : list of dict
+        Any two policies on the same episodes; see :func:`navrep_data.evaluate.scores.compare`.
     text : str
         The report as Markdown.
     files : list of Path
@@ -54,17 +56,20 @@ class Benchmark:
     rows: list[dict[str, Any]]
     variants: list[dict[str, Any]]
     baseline: dict[str, Any]
+    pairs: list[dict[str, Any]]
     text: str
     files: list[Path] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return results as ``--json`` prints them."""
-        rows = [{**r, "goal_success_rate": self.baseline["success_rate"]} for r in self.rows]
+        shares = ("contact_free_rate", "success_rate")
+        rows = [{**r, **{f"goal_{share}": self.baseline[share] for share in shares}} for r in self.rows]
         return {
             "results": rows,
             "variants": self.variants,
             "baseline": self.baseline,
+            "pairs": self.pairs,
             "files": [str(f) for f in self.files],
             "seconds": self.seconds,
         }
@@ -86,6 +91,7 @@ def benchmark(
     progress: Progress | None = None,
     ranges: str = "contract",
     scaling: str | None = None,
+    first_round: int = 0,
 ) -> Benchmark:
     """Play policies in a suite; the same call goes on after an interruption, or with more episodes.
 
@@ -127,6 +133,10 @@ def benchmark(
         ``"robot"``, the default: where the robot is slower or smaller than that of its training, a network sees and
         moves in proportion, see :meth:`navrep_data.zoo.policy.Policy.for_robot`. ``"none"``: as trained, and the
         default for ranges as released.
+    first_round : int
+        The first round: rounds ``first_round`` to ``first_round + episodes - 1`` of every scenario are played (in
+        ``navreptest`` a round is an episode). Results of another first round than 0 lie apart, in
+        ``out/SUITE-PHYSICS-roundR/``, and are never mixed with others.
 
     Returns
     -------
@@ -148,7 +158,7 @@ def benchmark(
         raise ConfigError(f"executor is {executor!r}, expected one of: {', '.join(EXECUTORS)}.")
     if address is not None and executor != "ray":
         raise ConfigError(f"address is {address}, which only Ray needs; expected executor ray with it.")
-    total = chosen.total(episodes)
+    total = chosen.total(episodes, first_round)
     specs = list(
         {
             s.name: s
@@ -157,13 +167,13 @@ def benchmark(
     )
     specs = [s if s.kind in NETWORKS else _plain(s) for s in specs]
     everybody = specs if any(s.name == "goal" for s in specs) else [resolve_policy("goal"), *specs]
-    folder = Path(out) / f"{chosen.name}-{kind}"
+    folder = Path(out) / chosen.folder(kind, first_round)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise translate_os_error(error, folder) from error
     # settings are compared before the first episode is played
-    opened = [(s, open_results(folder / file_name(s), header_of(s, chosen, kind))) for s in everybody]
+    opened = [(s, open_results(folder / file_name(s), header_of(s, chosen, kind, first_round))) for s in everybody]
     seconds, found = {}, {}
     place: AbstractContextManager[RayCluster[tuple[int, ...], list[Episode]] | None]
     place = RayCluster(address, workers) if executor == "ray" else nullcontext()
@@ -210,7 +220,7 @@ def _play(
     progress: Progress | None,
 ) -> bool:
     """Play what is missing, saving as episodes finish; returns whether anything was."""
-    todo = results.missing(total)
+    todo = results.missing(total)  # numbers in the suite
     if not todo:
         return False
     job = Job(suite.name, physics, spec, tuple(todo), spec.inference == "as_released" and spec.kind in NETWORKS, batch)
@@ -252,8 +262,9 @@ def write_report(
         raise DatasetNotFoundError(f"{folder} has no results of 'goal', expected them beside every score: play it too.")
     mine = [rows[r.name] for r in chosen]
     groups = by_variant(mine)
-    text = tables.report(mine, groups, baseline, chosen[0].suite.text)
-    report = Benchmark(mine, groups, baseline, text)
+    pairs = compare(chosen)
+    text = tables.report(mine, groups, baseline, chosen[0].suite.text, pairs)
+    report = Benchmark(mine, groups, baseline, pairs, text)
     atomic_write_bytes(folder / "report.md", text.encode())
     report.files.append(folder / "report.md")
     if figures:
@@ -291,6 +302,8 @@ def redraw(folder: str | os.PathLike[str], figures: bool = True) -> Benchmark:
         names = [found[0].header["name"]]
         if names != ["goal"] and (home / "goal.json").is_file():
             found.append(Results.load(home / "goal.json"))
-    if len({(r.suite.name, r.physics) for r in found}) > 1:
-        raise ConfigError(f"{path} holds results of several suites or physics, expected one: move them apart.")
+    if len({(r.suite.name, r.physics, r.first_round) for r in found}) > 1:
+        raise ConfigError(
+            f"{path} holds results of several suites, physics or first rounds, expected one: move them apart."
+        )
     return write_report(found, home, figures, names)

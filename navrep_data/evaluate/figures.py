@@ -23,7 +23,13 @@ Row = dict[str, Any]
 
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#7F7F7F")
 SUCCESS, COLLISION, TIMEOUT = "#0072B2", "#D55E00", "#E69F00"
-OUTCOMES = {"S": (SUCCESS, "goal reached", ""), "C": (COLLISION, "collision", "x"), "T": (TIMEOUT, "timeout", "s")}
+TOUCHED = "#CC79A7"
+OUTCOMES = {
+    "S": (SUCCESS, "goal, contact-free", ""),
+    "K": (TOUCHED, "goal after contact", "^"),
+    "C": (COLLISION, "collision", "x"),
+    "T": (TIMEOUT, "timeout", "s"),
+}
 """Colour, label and the marker at the end of a trajectory, so that outcomes differ without colour too."""
 PAPER_SCENARIOS = ("rlasl_office_j1", "irosasl_office_j2", "irosunity_scene_map3", "irosasl2")
 """Columns of the paper's figure: simplest and global planning on the realistic map, everything on the complex one,
@@ -81,8 +87,9 @@ def new_figure(width: float, height: float) -> Any:
 # --- bars ----------------------------------------------------------------------------------------------------------
 
 
-def _bar(label: str, row: Row) -> Row:
-    keys = {"value": "success_rate", "low": "success_rate_low", "high": "success_rate_high"}
+def _bar(label: str, row: Row, ends: tuple[str, str] = ("low", "high")) -> Row:
+    keys = {"value": "contact_free_rate", "released": "success_rate"}
+    keys |= {key: f"contact_free_rate_{end}" for key, end in zip(("low", "high"), ends, strict=True)}
     return {"label": label, **{key: row[name] for key, name in keys.items()}}
 
 
@@ -97,14 +104,15 @@ def _series(rows: Sequence[Row], groups: Sequence[Row], part: str | None) -> lis
         elif (group["variant"], group["inference"]) not in seen:
             seen.add((group["variant"], group["inference"]))
             g = group if part is None else group["per_map"][part]
-            keys = {"value": "success_rate", "low": "success_rate_min", "high": "success_rate_max"}
-            label = f"{group['variant']} ({len(group['runs'])} runs)"
-            bars_.append({"label": label, **{key: g[name] for key, name in keys.items()}})
+            bars_.append(_bar(f"{group['variant']} ({len(group['runs'])} runs)", g, ("min", "max")))
     return bars_
 
 
 def bars(rows: Sequence[Row], groups: Sequence[Row], baseline: Row) -> Any:
-    """Return the figure of success per policy, overall and per map, with intervals; `goal` is the dashed line."""
+    """Return the figure of both successes per policy, overall and per map: filled contact-free, outline as released.
+
+    Whiskers are those of the contact-free success; `goal` is the dashed line (contact-free) and the dotted one.
+    """
     parts = [None, *rows[0].get("per_map", {})]
     n = len(_series(rows, groups, None))
     figure = new_figure(max(5.0, (0.55 * n + 0.6) * len(parts) + 1.0), 4.6)
@@ -113,18 +121,24 @@ def bars(rows: Sequence[Row], groups: Sequence[Row], baseline: Row) -> Any:
         for i, bar in enumerate(_series(rows, groups, part)):
             if bar["value"] is None:
                 continue
-            value, low, high = (100 * bar[key] for key in ("value", "low", "high"))
-            ax.bar(i, value, color=PALETTE[i % len(PALETTE)], width=0.75, zorder=2)
+            value, low, high, released = (100 * bar[key] for key in ("value", "low", "high", "released"))
+            colour = PALETTE[i % len(PALETTE)]
+            ax.bar(i, released, facecolor="white", edgecolor=colour, linewidth=1.2, width=0.75, zorder=2)
+            ax.bar(i, value, color=colour, width=0.75, zorder=2)
             error = [[max(0.0, value - low)], [max(0.0, high - value)]]
             ax.errorbar(i, value, error, color="black", capsize=3, linewidth=1, zorder=3)
             # on white, since the dashed line may pass behind it
             white = {"boxstyle": "square,pad=0.05", "facecolor": "white", "edgecolor": "none"}
             ax.annotate(
-                f"{value:.0f}", (i, high), (0, 3), textcoords="offset points", ha="center", fontsize=8, bbox=white
-            )
-        level = (baseline if part is None else baseline["per_map"][part])["success_rate"]
-        if level is not None:
-            ax.axhline(100 * level, color="black", linestyle="--", linewidth=0.8, zorder=1, label="goal")
+                f"{value:.0f} / {released:.0f}", (i, max(high, released)), (0, 3), textcoords="offset points",
+                ha="center", fontsize=7.5, bbox=white,
+            )  # fmt: skip
+        of = baseline if part is None else baseline["per_map"][part]
+        for share, style, words in (("contact_free", "--", "contact-free"), ("success", ":", "as released")):
+            level = of[f"{share}_rate"]
+            if level is not None:
+                label = f"goal, {words}"
+                ax.axhline(100 * level, color="black", linestyle=style, linewidth=0.8, zorder=1, label=label)
         labels = [bar["label"] for bar in _series(rows, groups, part)]
         ax.set_xticks(range(n), labels, rotation=45, ha="right", rotation_mode="anchor", fontsize=8)
         ax.set_xlim(-0.6, n - 0.4)
@@ -136,20 +150,30 @@ def bars(rows: Sequence[Row], groups: Sequence[Row], baseline: Row) -> Any:
     axes[0].set_ylim(0, 108)
     axes[0].legend(loc="upper left", fontsize=7, frameon=False)
     row = rows[0]
-    figure.suptitle(f"{row['suite']}, {row['physics']} physics, {row['episodes']:,} episodes per policy", fontsize=10)
-    note = "Whiskers: 95 % intervals (Wilson)" + ("; several runs: least to greatest" if groups else "")
-    figure.supxlabel(f"{note}. Dashed: straight to the goal.", fontsize=7)
+    played = f"{row['episodes']:,} episodes per policy, rounds {row['rounds']}"
+    figure.suptitle(f"{row['suite']}, {row['physics']} physics, {played}", fontsize=10)
+    note = "Filled: contact-free, outline: as released. Whiskers, contact-free: 95 % intervals (Wilson)"
+    note += "; several runs: least to greatest" if groups else ""
+    figure.supxlabel(f"{note}.\nDashed and dotted: straight to the goal.", fontsize=7)
     return figure
 
 
 # --- trajectories --------------------------------------------------------------------------------------------------
 
 
+def _kind(results: Results, k: int) -> str:
+    """Return the key of :data:`OUTCOMES` for an episode; none of them where it was not played."""
+    if k >= len(results.outcome):
+        return ""
+    return "K" if results.outcome[k] == "S" and not results.contact_free(k) else results.outcome[k]
+
+
 def _paths(ax: Any, results: Results, episodes: Sequence[int], linewidth: float = 0.8, alpha: float = 0.7) -> None:
     """Draw the stored trajectories of some episodes; failures lie above, so that few are not hidden by many."""
-    for letter in "STC":
-        for k in episodes:
-            if k < len(results.outcome) and results.outcome[k] == letter and k in results.trajectories:
+    kinds = {k: _kind(results, k) for k in episodes if k in results.trajectories}
+    for letter in "SKTC":
+        for k, kind in kinds.items():
+            if kind == letter:
                 xy = results.trajectories[k]
                 ax.plot(*xy.T, color=OUTCOMES[letter][0], linewidth=linewidth, alpha=alpha, zorder=4)
                 end = {"color": OUTCOMES[letter][0], "marker": OUTCOMES[letter][2], "fillstyle": "none"}
@@ -177,13 +201,13 @@ def _free_corner(frame: Sequence[float], marks: Any, lines: Any) -> tuple[str, s
 def _overlaid(
     ax: Any, results: Results, episodes: Sequence[int], size: float = 9, corner: tuple[str, str] = CORNERS[0]
 ) -> None:
-    """Write the success in percent over a panel; its interval below, where there is room."""
-    played = [k for k in episodes if k < len(results.outcome) and results.outcome[k] in OUTCOMES]
+    """Write both successes in percent over a panel, contact-free first; its interval below, where there is room."""
+    played = [kind for k in episodes if (kind := _kind(results, k)) in OUTCOMES]
     if not played:
         return
-    won = sum(results.outcome[k] == "S" for k in played)
-    low, high = (100 * end for end in wilson(won, len(played)))
-    text = f"{100 * won / len(played):.0f} %"
+    free = played.count("S")
+    low, high = (100 * end for end in wilson(free, len(played)))
+    text = f"{100 * free / len(played):.0f} / {100 * (free + played.count('K')) / len(played):.0f} %"
     if size > 8:
         text += f"\n({low:.0f} to {high:.0f})"
     box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
@@ -198,7 +222,7 @@ def _legend(figure: Any) -> None:
         Line2D([], [], color=colour, label=label, marker=marker, fillstyle="none", markersize=5)
         for colour, label, marker in OUTCOMES.values()
     ]
-    figure.legend(handles=handles, loc="outside upper right", ncols=3, fontsize=8, frameon=False)
+    figure.legend(handles=handles, loc="outside upper right", ncols=len(handles), fontsize=7.5, frameon=False)
 
 
 def overlay(found: Sequence[Results], rows: Sequence[Row]) -> Any:
@@ -308,8 +332,9 @@ def grid(results: Results) -> Any:
 
 
 _NOTE = (
-    "Lines: a scenario's first 20 episodes. Per cent: success over all its episodes. Dot: start, star: goal, circles: "
-    "where humans start (dark: those that walk).\nMaps: asl-pepper-2d-sim, which states no licence."
+    "Lines: a scenario's first 20 episodes. Per cent: success over all its episodes, contact-free / as released. "
+    "Dot: start, star: goal, circles:\nwhere humans start (dark: those that walk). Maps: asl-pepper-2d-sim, which "
+    "states no licence."
 )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from navrep_data.evaluate._on_maps import guided_robots, start_gaps
-from navrep_data.sim import SimConfig, Simulator, robot_contract, scale_actions
+from navrep_data.sim import SimConfig, Simulator, Touches, robot_contract, scale_actions
 from navrep_data.sim import _layout as lay
 from navrep_data.sim._fast_marching import UPWIND_FINAL, march
 from navrep_data.sim.map_tables import RADIUS
@@ -89,6 +89,10 @@ class ScenarioWorlds:
         """Return the robots' radii (W,)."""
         radii: F64 = self._state.agents[:, 0, lay.A_RADIUS]
         return radii
+
+    def touches(self) -> Touches:
+        """Return whom and what the robots touched during the last step."""
+        return self.simulator.touches()
 
     def gaps(self) -> tuple[F64, F64]:
         """Return the gaps to the nearest human and obstacle, both (W,)."""

@@ -11,6 +11,9 @@ F64 = NDArray[np.float64]
 
 PERSONAL_SPACE = 0.2
 """Gap to a human [m] below which a robot is in its personal space: the paper's danger distance."""
+STOPPED_SPEED = 0.05
+"""Speed [m/s] below which a robot counts as stopped: a tenth of the slower suite's largest, above rounding."""
+METRES_PER_KM = 1000.0
 
 
 @dataclass(frozen=True)
@@ -45,9 +48,50 @@ METRICS: tuple[Metric, ...] = (
         "smallest gap between the robot's edge and a human's disc or an obstacle (of those within a metre, on maps)",
     ),
     Metric("personal_space_time", "s", "time with the nearest human's disc less than 0.2 m from the robot's edge"),
+    Metric(
+        "time_stopped", "s", "time at a speed below 0.05 m/s; speed = distance between positions one step apart / dt"
+    ),
     Metric("mean_jerk", "m/s^3", "mean norm of the second difference of the velocity over the time step squared"),
 )
-"""All means that results hold beside the shares of goal, collision and timeout."""
+"""All means that results hold beside the shares of success, collision and timeout."""
+
+RATIOS: tuple[Metric, ...] = (
+    Metric("contacts_per_km", "1/km", "all contacts of all episodes / all path lengths; intervals resample episodes"),
+    Metric(
+        "personal_space_share", "", "all time in personal space / all time: the share of time under 0.2 m from people"
+    ),
+)
+"""Ratios of sums over episodes."""
+
+CONTACT_TEXT = (
+    "contact: a maximal run of steps in which the robot touches the same person, or static matter, by the rule of the "
+    "simulator's collisions, whether it does damage or not"
+)
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """What a robot touched in an episode.
+
+    Attributes
+    ----------
+    human : int
+        Number of contacts with people: for every person the maximal runs of steps in touch.
+    obstacle : int
+        The same with static matter: walls, obstacles, the border, the map's edge.
+    speed : float
+        Largest speed at a contact [m/s]: with people the norm of the difference of both velocities, with matter the
+        robot's own speed. NaN without a contact.
+    """
+
+    human: int = 0
+    obstacle: int = 0
+    speed: float = float("nan")
+
+    @property
+    def total(self) -> int:
+        """Number of all contacts."""
+        return self.human + self.obstacle
 
 
 def path_length(positions: ArrayLike) -> float:
@@ -106,6 +150,20 @@ def personal_space_time(human_gaps: ArrayLike, dt: float) -> float:
     return float(np.count_nonzero(np.asarray(human_gaps, np.float64)[1:] < PERSONAL_SPACE)) * dt
 
 
+def time_stopped(positions: ArrayLike, dt: float) -> float:
+    """Return for how long the robot was slower than 0.05 m/s [s].
+
+    Parameters
+    ----------
+    positions : array_like of shape (T + 1, 2)
+        As for :func:`path_length`.
+    dt : float
+        Time step [s].
+    """
+    steps = np.diff(_points(positions), axis=0)
+    return float(np.count_nonzero(np.hypot(steps[:, 0], steps[:, 1]) < STOPPED_SPEED * dt)) * dt
+
+
 def mean_jerk(positions: ArrayLike, dt: float) -> float:
     """Return the mean norm of the jerk [m/s^3], NaN for paths of less than three steps.
 
@@ -153,6 +211,7 @@ def measure(
         "spl": spl(success, shortest, length),
         "min_clearance": min_clearance(human_gaps, static_gaps),
         "personal_space_time": personal_space_time(human_gaps, dt),
+        "time_stopped": time_stopped(points, dt),
         "mean_jerk": mean_jerk(points, dt),
     }
 

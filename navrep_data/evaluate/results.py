@@ -6,6 +6,7 @@ import json
 import math
 import platform
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from navrep_data._version import __version__
-from navrep_data.errors import CorruptDataError, DatasetMismatchError
-from navrep_data.evaluate.metrics import METRICS
+from navrep_data.errors import CorruptDataError, DatasetMismatchError, SchemaVersionError
+from navrep_data.evaluate.metrics import METRICS, Contacts
 from navrep_data.evaluate.policies import PilotSpec
 from navrep_data.evaluate.runner import Episode
 from navrep_data.evaluate.suites import Suite, get_suite
@@ -23,7 +24,8 @@ from navrep_data.io import atomic_write_bytes, read_json
 from navrep_data.schema import Event, fed_as, result_name
 
 FORMAT = "navrep-data-benchmark"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""2: contacts, time stopped and the first round."""
 LETTERS = {Event.GOAL: "S", Event.TIMEOUT: "T"}
 """One letter per outcome: S goal, T timeout, C any collision, - not played."""
 NOT_PLAYED = "-"
@@ -34,7 +36,7 @@ _DIGITS = 5
 
 
 class Results:
-    """What one policy did in one suite.
+    """What one policy did in consecutive episodes of one suite; lists begin with that of number `first_episode`.
 
     Parameters
     ----------
@@ -51,8 +53,10 @@ class Results:
         Steps per episode.
     metrics : dict of str to list of float
         Per episode; NaN where a metric means nothing.
+    contacts : list of Contacts
+        What the robot touched, per episode.
     trajectories : dict of int to ndarray of shape (n, 2)
-        Positions [m] by episode.
+        Positions [m] by index into the lists.
     """
 
     def __init__(self, header: dict[str, Any]) -> None:
@@ -61,7 +65,33 @@ class Results:
         self.events: list[str] = []
         self.steps: list[int] = []
         self.metrics: dict[str, list[float]] = {m.name: [] for m in METRICS}
+        self.contacts: list[Contacts] = []
         self.trajectories: dict[int, NDArray[np.float64]] = {}
+
+    @property
+    def first_round(self) -> int:
+        """The first round that was played."""
+        return int(self.header["settings"]["first_round"])
+
+    @property
+    def first_episode(self) -> int:
+        """Number of the first episode in the suite."""
+        return self.first_round * len(self.suite.scenarios)
+
+    @property
+    def dt(self) -> float:
+        """Time step [s]."""
+        return float(self.suite.config(self.physics).sensor.dt)
+
+    @property
+    def rounds(self) -> str:
+        """The rounds that were played, in words."""
+        scenarios = len(self.suite.scenarios)
+        return f"{self.first_round} to {self.first_round + max(1, -(-len(self.outcome) // scenarios)) - 1}"
+
+    def contact_free(self, index: int) -> bool:
+        """Return whether an episode ended at the goal with no contact at all."""
+        return self.outcome[index] == LETTERS[Event.GOAL] and self.contacts[index].total == 0
 
     @property
     def name(self) -> str:
@@ -79,20 +109,23 @@ class Results:
         return str(self.header["settings"]["physics"])
 
     def missing(self, total: int) -> list[int]:
-        """Return the numbers below `total` of the episodes that are not there yet."""
-        return [k for k in range(total) if k >= len(self.outcome) or self.outcome[k] == NOT_PLAYED]
+        """Return the numbers of those of the first `total` episodes that are not there yet."""
+        lacks = [i for i in range(total) if i >= len(self.outcome) or self.outcome[i] == NOT_PLAYED]
+        return [self.first_episode + i for i in lacks]
 
     def add(self, episodes: Iterable[Episode]) -> None:
         """Put finished episodes in."""
         for e in episodes:
-            self._grow(e.episode + 1)
-            self.outcome[e.episode] = LETTERS.get(e.event, "C")
-            self.events[e.episode] = e.event.label
-            self.steps[e.episode] = e.steps
+            i = e.episode - self.first_episode
+            self._grow(i + 1)
+            self.outcome[i] = LETTERS.get(e.event, "C")
+            self.events[i] = e.event.label
+            self.steps[i] = e.steps
             for name, values in self.metrics.items():
-                values[e.episode] = round(e.metrics[name], _DIGITS)
-            if e.episode < TRAJECTORIES:
-                self.trajectories[e.episode] = e.trajectory / 100.0
+                values[i] = round(e.metrics[name], _DIGITS)
+            self.contacts[i] = replace(e.contacts, speed=round(e.contacts.speed, _DIGITS))
+            if i < TRAJECTORIES:
+                self.trajectories[i] = e.trajectory / 100.0
 
     def _grow(self, n: int) -> None:
         more = n - len(self.outcome)
@@ -102,12 +135,14 @@ class Results:
             self.steps += [0] * more
             for values in self.metrics.values():
                 values += [math.nan] * more
+            self.contacts += [Contacts()] * more
 
     def first(self, total: int) -> Results:
-        """Return the results of the episodes below `total` alone."""
+        """Return the results of the first `total` episodes alone."""
         part = Results(self.header)
         part.outcome, part.events, part.steps = self.outcome[:total], self.events[:total], self.steps[:total]
         part.metrics = {name: values[:total] for name, values in self.metrics.items()}
+        part.contacts = self.contacts[:total]
         part.trajectories = {k: xy for k, xy in self.trajectories.items() if k < total}
         return part
 
@@ -117,13 +152,16 @@ class Results:
         names = [s.name for s in suite.scenarios]
         n = len(self.outcome)
         columns: dict[str, Any] = {
-            "seed": [suite.seed(k) for k in range(n)],
-            "scenario": [names[suite.scenario(k)] for k in range(n)] if len(names) > 1 else [],
+            "seed": [suite.seed(self.first_episode + i) for i in range(n)],
+            "scenario": [names[suite.scenario(i)] for i in range(n)] if len(names) > 1 else [],
             "event": self.events,
             "steps": self.steps,
         }
         for name, values in self.metrics.items():
-            columns[name] = [None if math.isnan(v) else v for v in values]
+            columns[name] = _nulls(values)
+        columns["contacts_human"] = [c.human for c in self.contacts]
+        columns["contacts_obstacle"] = [c.obstacle for c in self.contacts]
+        columns["contact_speed"] = _nulls([c.speed for c in self.contacts])
         paths = {
             str(k): np.rint(100.0 * xy).astype(int).ravel().tolist() for k, xy in sorted(self.trajectories.items())
         }
@@ -141,8 +179,15 @@ class Results:
         ------
         CorruptDataError
             If it is no results file, or does not fit itself.
+        SchemaVersionError
+            If it is of the version that did not record contacts.
         """
         value = read_json(path, _MAX_BYTES)
+        if isinstance(value, dict) and (value.get("format"), value.get("version")) == (FORMAT, 1):
+            raise SchemaVersionError(
+                f"{path} is of format version 1, which does not say what the robot touched, expected version "
+                f"{FORMAT_VERSION}: play it again, navrep-data benchmark NAME --suite SUITE with another --out."
+            )
         try:
             if value["format"] != FORMAT or value["version"] != FORMAT_VERSION:
                 raise ValueError(f"format {value['format']!r} version {value['version']!r}")
@@ -162,15 +207,28 @@ class Results:
             raise ValueError("unknown outcomes")
         self.events, self.steps = [str(e) for e in columns["event"]], [int(s) for s in columns["steps"]]
         self.metrics = {m.name: [math.nan if v is None else float(v) for v in columns[m.name]] for m in METRICS}
-        lengths = {len(self.events), len(self.steps), *map(len, self.metrics.values())}
+        touched = [columns[name] for name in ("contacts_human", "contacts_obstacle", "contact_speed")]
+        lengths = {len(self.events), len(self.steps), *map(len, self.metrics.values()), *map(len, touched)}
         if lengths != {n}:
             raise ValueError("columns of different lengths")
+        self.contacts = [
+            Contacts(int(h), int(o), math.nan if v is None else float(v)) for h, o, v in zip(*touched, strict=True)
+        ]
+        if any(min(c.human, c.obstacle) < 0 for c in self.contacts):
+            raise ValueError("negative contacts")
+        first = value["settings"]["first_round"]
+        if isinstance(first, bool) or not isinstance(first, int) or not 0 <= first < 1_000_000:
+            raise ValueError("a first round that is none")
         if not all(isinstance(value["settings"][key], str) for key in ("suite", "physics", "inference")):
             raise TypeError("settings that are no text")
         self.trajectories = {
             int(k): np.asarray(xy, np.float64).reshape(-1, 2) / 100.0 for k, xy in value["trajectories_cm"].items()
         }
         get_suite(value["settings"]["suite"])  # raises where this version does not know it
+
+
+def _nulls(values: Sequence[float]) -> list[float | None]:
+    return [None if math.isnan(v) else v for v in values]
 
 
 def _lines(value: dict[str, Any]) -> bytes:
@@ -186,7 +244,7 @@ def _lines(value: dict[str, Any]) -> bytes:
     return (text(value, 0) + "\n").encode()
 
 
-def header_of(spec: PilotSpec, suite: Suite, physics: str) -> dict[str, Any]:
+def header_of(spec: PilotSpec, suite: Suite, physics: str, first_round: int = 0) -> dict[str, Any]:
     """Return what results say of who played what with which versions."""
     how = fed_as(spec.settings())
     return {
@@ -195,7 +253,7 @@ def header_of(spec: PilotSpec, suite: Suite, physics: str) -> dict[str, Any]:
         # runs that were fed otherwise are never counted among the runs of a variant
         "variant": f"{spec.variant} ({how})" if how else spec.variant,
         "settings": {
-            **suite.settings(physics),
+            **suite.settings(physics, first_round),
             "inference": spec.inference,
             **spec.settings(),
             "policy_files": spec.files,

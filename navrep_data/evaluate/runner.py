@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from navrep_data.errors import SimulationError
-from navrep_data.evaluate.metrics import measure
+from navrep_data.evaluate.metrics import Contacts, measure
 from navrep_data.evaluate.pilots import BLOCK, Pilot
 from navrep_data.evaluate.suites import Suite
 from navrep_data.evaluate.worlds import Worlds
 from navrep_data.schema import Event
+from navrep_data.sim import Touches
 
 DEFAULT_BATCH = 64
 TRAJECTORY_POINTS = 60
@@ -40,6 +41,8 @@ class Episode:
         By name, see :data:`METRICS`.
     trajectory : ndarray of shape (n, 2), int32
         Where the robot was, in centimetres, at most 60 points, first and last among them.
+    contacts : Contacts
+        What the robot touched.
     """
 
     episode: int
@@ -47,6 +50,36 @@ class Episode:
     steps: int
     metrics: dict[str, float]
     trajectory: NDArray[np.int32]
+    contacts: Contacts = field(default_factory=Contacts)
+
+
+class _ContactCounter:
+    """Counts the contacts of the episodes that are being played, as :class:`Contacts` defines them."""
+
+    def __init__(self, n: int) -> None:
+        self.human, self.obstacle = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self.speed = np.full(n, np.nan)
+        self._agents: NDArray[np.bool_] = np.zeros((n, 0), np.bool_)
+        self._matter = np.zeros(n, np.bool_)
+
+    def begin(self, mask: NDArray[np.bool_]) -> None:
+        self.human[mask], self.obstacle[mask], self.speed[mask] = 0, 0, np.nan
+        self._agents[mask], self._matter[mask] = False, False
+
+    def advance(self, touches: Touches) -> None:
+        if self._agents.shape != touches.agents.shape:
+            self._agents = np.zeros_like(touches.agents)
+        self.human += (touches.agents & ~self._agents).sum(axis=1)
+        self.obstacle += touches.matter & ~self._matter
+        speeds = np.column_stack([
+            np.where(touches.agents, touches.agent_speeds, np.nan),
+            np.where(touches.matter, touches.matter_speeds, np.nan),
+        ])  # fmt: skip
+        self.speed = np.fmax(self.speed, np.fmax.reduce(speeds, axis=1))
+        self._agents, self._matter = touches.agents, touches.matter
+
+    def of(self, w: int) -> Contacts:
+        return Contacts(int(self.human[w]), int(self.obstacle[w]), float(self.speed[w]))
 
 
 class _Recorder:
@@ -57,17 +90,20 @@ class _Recorder:
         self.paths = np.zeros((worlds.n, max_steps + 1, 4))  # x, y, gap to humans, gap to obstacles
         self.steps = np.zeros(worlds.n, np.int64)
         self.shortest = np.zeros(worlds.n)
+        self.contacts = _ContactCounter(worlds.n)
         self._all = np.arange(worlds.n)
 
     def begin(self, mask: NDArray[np.bool_]) -> None:
         self.steps[mask] = 0
         self.shortest[mask] = self.worlds.shortest()[mask]
+        self.contacts.begin(mask)
         self._write(mask)
 
     def advance(self, active: NDArray[np.bool_]) -> None:
         self.steps[active] += 1
         if (self.steps >= self.paths.shape[1]).any():
             raise SimulationError(f"An episode is longer than {self.paths.shape[1] - 1} steps: a bug of its suite.")
+        self.contacts.advance(self.worlds.touches())
         self._write(active)
 
     def _write(self, mask: NDArray[np.bool_]) -> None:
@@ -84,7 +120,7 @@ class _Recorder:
         metrics = measure(
             path[:, :2], path[:, 2], path[:, 3], self.worlds.sensor.dt, event == Event.GOAL, float(self.shortest[w])
         )
-        return Episode(episode, event, steps, metrics, thin(path[:, :2]))
+        return Episode(episode, event, steps, metrics, thin(path[:, :2]), self.contacts.of(w))
 
 
 def thin(positions: NDArray[np.float64]) -> NDArray[np.int32]:

@@ -9,8 +9,8 @@ from typing import Any
 from navrep_data.errors import CorruptDataError, DatasetMismatchError
 from navrep_data.evaluate.policies import BASELINES
 from navrep_data.evaluate.results import Results
-from navrep_data.evaluate.scores import score, summary
-from navrep_data.evaluate.suites import suite_names
+from navrep_data.evaluate.scores import SUCCESSES, score, summary
+from navrep_data.evaluate.suites import get_suite, suite_names
 from navrep_data.evaluate.world_model import WorldModelError
 from navrep_data.evaluate.world_model_results import FOLDER
 from navrep_data.evaluate.world_model_results import load as load_world_model
@@ -58,8 +58,10 @@ def source_of(name: str) -> str:
     return "other"
 
 
-def find_benchmarks(folder: Path, suite: str, physics: str = "original") -> list[Results]:
+def find_benchmarks(folder: Path, suite: str, physics: str = "original", first_round: int = 0) -> list[Results]:
     """Return all results of a suite below a folder, by name; of two of the same, the one with more episodes.
+
+    Those of another first round lie in folders of another name and are not among them.
 
     Raises
     ------
@@ -67,9 +69,9 @@ def find_benchmarks(folder: Path, suite: str, physics: str = "original") -> list
         If a file is no results file.
     """
     found: dict[str, Results] = {}
-    for path in sorted(folder.rglob(f"{suite}-{physics}/*.json")):
+    for path in sorted(folder.rglob(f"{get_suite(suite).folder(physics, first_round)}/*.json")):
         results = Results.load(path)
-        if (results.suite.name, results.physics) != (suite, physics):
+        if (results.suite.name, results.physics, results.first_round) != (suite, physics, first_round):
             raise CorruptDataError(f"{path} holds {results.suite.name} in {results.physics} physics: move it apart.")
         known = found.get(results.name)
         if known is None or _played(results) > _played(known):
@@ -99,17 +101,25 @@ def benchmark_entries(folder: Path, record: Record) -> list[dict[str, Any]]:
     entries = []
     for suite in suite_names():
         for physics in ("original", "consistent"):
-            found = {r.name: r for r in find_benchmarks(folder, suite, physics)}
-            mine = found.get(record.name)
-            if mine is None:
-                continue
-            _same_weights(mine.header["settings"]["policy_files"], record, str(folder))
-            if "goal" not in found:
-                raise CorruptDataError(
-                    f"{folder} has no results of 'goal' in {suite}, expected them beside every score."
-                )
-            entries.append(_entry(mine, found["goal"], record))
+            for first_round in _first_rounds(folder, suite, physics):
+                found = {r.name: r for r in find_benchmarks(folder, suite, physics, first_round)}
+                mine = found.get(record.name)
+                if mine is None:
+                    continue
+                _same_weights(mine.header["settings"]["policy_files"], record, str(folder))
+                if "goal" not in found:
+                    raise CorruptDataError(
+                        f"{folder} has no results of 'goal' in {suite}, expected them beside every score."
+                    )
+                entries.append(_entry(mine, found["goal"], record))
     return entries
+
+
+def _first_rounds(folder: Path, suite: str, physics: str) -> list[int]:
+    """Return the first rounds of the results below a folder."""
+    start = get_suite(suite).folder(physics, 1)[:-1]
+    later = {p.parent.name.removeprefix(start) for p in folder.rglob(f"{start}*/*.json")}
+    return [0, *sorted(int(name) for name in later if name.isdecimal())]
 
 
 def _same_weights(files: dict[str, str], record: Record, where: str) -> None:
@@ -128,17 +138,26 @@ def _entry(mine: Results, goal: Results, record: Record) -> dict[str, Any]:
     rounds = row["episodes"] / len(suite.scenarios)
     if rounds != suite.rounds:
         command += f" --episodes {rounds:g}"
-    shares = ("success_rate", "success_rate_low", "success_rate_high", "collision_rate", "timeout_rate")
+    if mine.first_round:
+        command += f" --first-round {mine.first_round}"
+    shares = [f"{name}_rate{end}" for name in SUCCESSES for end in ("", "_low", "_high")]
+    beside = score(goal, played)
     entry: dict[str, Any] = {
         "suite": suite.name,
         "physics": mine.physics,
         "episodes": row["episodes"],
-        **{key: round(row[key], 6) for key in shares},
-        "goal_success_rate": round(score(goal, played)["success_rate"], 6),
+        "rounds": row["rounds"],
+        **{key: round(row[key], 6) for key in (*shares, "collision_rate", "timeout_rate")},
+        **{
+            key: None if row[key] is None else round(row[key], 6) for key in ("contacts_per_km", "personal_space_share")
+        },
+        **{f"goal_{name}_rate": round(beside[f"{name}_rate"], 6) for name in SUCCESSES},
         "command": command,
     }
     if "per_map" in row:
-        entry["per_map"] = {name: round(part["success_rate"], 6) for name, part in row["per_map"].items()}
+        parts = {"per_map_contact_free": "contact_free_rate", "per_map": "success_rate"}
+        for key, share in parts.items():
+            entry[key] = {name: round(part[share], 6) for name, part in row["per_map"].items()}
     return entry
 
 

@@ -55,6 +55,47 @@ def bootstrap(values: ArrayLike, seed: int = 0) -> tuple[float, float, float]:
     return float(x.mean()), float(low), float(high)
 
 
+def bootstrap_ratio(above: ArrayLike, below: ArrayLike, seed: int = 0) -> tuple[float, float, float]:
+    """Return sum(above) / sum(below) and its 95 % percentile interval over resampled pairs; NaN where below sums to 0.
+
+    Parameters
+    ----------
+    above, below : array_like of shape (n,)
+        Two numbers of each episode; or, over clusters, sums of each cluster: the cluster bootstrap.
+    seed : int
+        Same seed and values, same interval.
+    """
+    a, b = np.asarray(above, np.float64), np.asarray(below, np.float64)
+    if len(a) == 0 or b.sum() == 0.0:
+        return math.nan, math.nan, math.nan
+    rng = np.random.default_rng(seed)
+    ratios = []
+    for _ in range(RESAMPLES):
+        chosen = rng.integers(0, len(a), len(a))
+        if total := b[chosen].sum():
+            ratios.append(a[chosen].sum() / total)
+    low, high = np.quantile(ratios, [0.025, 0.975])
+    return float(a.sum() / b.sum()), float(low), float(high)
+
+
+def mcnemar(first_only: int, second_only: int) -> float:
+    """Return the two-sided p-value of McNemar's exact test of paired outcomes.
+
+    Parameters
+    ----------
+    first_only, second_only : int
+        Discordant pairs: in how many episodes only the first, or only the second, succeeded. 1 without any.
+
+    Notes
+    -----
+    Q. McNemar 1947; exact, by the binomial distribution with share 1/2, for any number of discordant pairs.
+    """
+    from scipy.stats import binomtest
+
+    discordant = first_only + second_only
+    return float(binomtest(first_only, discordant, 0.5).pvalue) if discordant else 1.0
+
+
 def spread(values: Sequence[float]) -> tuple[float, float, float]:
     """Return mean, least and greatest of the scores of several runs of one variant."""
     return float(np.mean(values)), float(min(values)), float(max(values))

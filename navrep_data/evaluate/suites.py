@@ -88,28 +88,50 @@ class Suite:
         """Return the index of the scenario that an episode plays."""
         return episode % len(self.scenarios)
 
-    def total(self, episodes: int | None) -> int:
+    def total(self, episodes: int | None, first_round: int = 0) -> int:
         """Return how many episodes `episodes` per scenario are (None = the suite's own number).
+
+        Parameters
+        ----------
+        episodes : int or None
+            Rounds: each plays every scenario once.
+        first_round : int
+            The first of them.
 
         Raises
         ------
         ConfigError
-            If the suite has no so many.
+            If the suite has no so many, or they would go beyond its last round.
         """
         rounds = self.rounds if episodes is None else episodes
+        each = "" if len(self.scenarios) == 1 else " per scenario"
+        if isinstance(first_round, bool) or not isinstance(first_round, int) or not 0 <= first_round < self.max_rounds:
+            raise ConfigError(
+                f"first_round is {first_round!r}, expected a whole number from 0 to {self.max_rounds - 1} in "
+                f"{self.name}."
+            )
         if isinstance(rounds, bool) or not isinstance(rounds, int) or not 1 <= rounds <= self.max_rounds:
-            each = "" if len(self.scenarios) == 1 else " per scenario"
             raise ConfigError(
                 f"episodes is {rounds!r}, expected a whole number from 1 to {self.max_rounds}{each} in {self.name}."
             )
+        if first_round + rounds > self.max_rounds:
+            raise ConfigError(
+                f"Rounds {first_round} to {first_round + rounds - 1} were asked for, {self.name} ends with round "
+                f"{self.max_rounds - 1}: expected at most {self.max_rounds - first_round} episodes{each} from there."
+            )
         return rounds * len(self.scenarios)
 
-    def settings(self, physics: str) -> dict[str, Any]:
-        """Return what decides an episode, as plain JSON values."""
+    def folder(self, physics: str, first_round: int = 0) -> str:
+        """Return the name of the folder that results lie in; rounds that begin elsewhere lie apart."""
+        return f"{self.name}-{physics}" + (f"-round{first_round}" if first_round else "")
+
+    def settings(self, physics: str, first_round: int = 0) -> dict[str, Any]:
+        """Return what decides the episodes, as plain JSON values."""
         config = self.config(physics).to_dict()
         return {
             "suite": self.name,
             "physics": physics,
+            "first_round": first_round,
             "first_seed": self.first_seed,
             "config_sha256": hashlib.sha256(json_bytes(config)).hexdigest(),
             "data_sha256": self.data_hash(),

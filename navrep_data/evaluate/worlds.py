@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from navrep_data.evaluate._polygons import orca_robots, polygon_gaps
 from navrep_data.schema import RobotContract, SensorContract
-from navrep_data.sim import SimConfig, Simulator, robot_contract, scale_actions
+from navrep_data.sim import SimConfig, Simulator, Touches, robot_contract, scale_actions
 from navrep_data.sim import _layout as lay
 
 F64 = NDArray[np.float64]
@@ -54,6 +54,9 @@ class Worlds(Protocol):
 
     def radii(self) -> F64:
         """Return the robots' radii (W,)."""
+
+    def touches(self) -> Touches:
+        """Return whom and what the robots touched during the last step."""
 
     def gaps(self) -> tuple[F64, F64]:
         """Return the gaps between the robots' edges and the nearest human and obstacle, both (W,)."""
@@ -130,6 +133,10 @@ class PolygonWorlds:
     def radii(self) -> F64:
         """See :class:`Worlds`."""
         return self._robots(lay.A_RADIUS)
+
+    def touches(self) -> Touches:
+        """See :class:`Worlds`."""
+        return self.simulator.touches()
 
     def gaps(self) -> tuple[F64, F64]:
         """See :class:`Worlds`."""

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, NavrepDataError
+from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, NavrepDataError, SchemaVersionError
 from navrep_data.io import read_json
 from navrep_data.schema import DT, EVENT_NAMES, result_name
 from navrep_data.view.packing import Blob
 from navrep_data.view.page import DEFAULT_MAX_BYTES, MIN_MAX_BYTES, Page, assemble, clip
 
-FORMAT, FORMAT_VERSION = "navrep-data-benchmark", 1
+FORMAT, FORMAT_VERSION = "navrep-data-benchmark", 2
 MAX_FILE_BYTES = 64 << 20
 MAX_POLICIES = 60
 MAX_EPISODES = 20_000
@@ -31,11 +31,15 @@ MAX_POINTS = 2000
 """Points of one trajectory that are shown."""
 MAX_MAP_CELLS = 1024
 """Cells of a map along its longer side; finer ones are made coarser, occupied where any cell was."""
+CONTACTS = ("contacts_human", "contacts_obstacle")
+"""Columns that count what the robot touched."""
 METRIC_UNITS = {
     "time_to_goal": "s",
     "path_length": "m",
     "min_clearance": "m",
     "personal_space_time": "s",
+    "time_stopped": "s",
+    "contact_speed": "m/s",
     "mean_jerk": "m/s\u00b3",
 }
 """Units of the benchmark's metrics, which its files do not say."""
@@ -78,12 +82,14 @@ class _Policy:
     event: list[str]
     steps: list[int]
     seed: list[int]
+    touched: list[int]
     metrics: dict[str, list[float | None]]
     paths: dict[int, F64] = field(repr=False)
 
-    def rate(self) -> float:
-        """Return the share of episodes that reached the goal."""
-        return self.event.count("goal") / max(1, len(self.event))
+    def rate(self) -> tuple[float, float]:
+        """Return the shares of episodes that reached the goal without contact, and at all."""
+        reached = [n for n, event in zip(self.touched, self.event, strict=True) if event == "goal"]
+        return reached.count(0) / max(1, len(self.event)), len(reached) / max(1, len(self.event))
 
 
 def is_results(path: Path) -> bool:
@@ -168,21 +174,28 @@ def _load(root: Path) -> list[_Policy]:
         raise DatasetNotFoundError(f"{root} holds no results of navrep-data benchmark, expected OUT/SUITE-PHYSICS.")
     if len(found) > MAX_POLICIES:
         raise ConfigError(f"{root} has results of {len(found)} policies, expected at most {MAX_POLICIES}: name a file.")
-    kinds = {(str(p.settings.get("suite")), str(p.settings.get("physics"))) for p in found}
+    kinds = {tuple(str(p.settings.get(key)) for key in ("suite", "physics", "first_round")) for p in found}
     if len(kinds) > 1:
-        raise ConfigError(f"{root} holds results of several suites or physics, expected one: move them apart.")
-    return sorted(found, key=lambda p: (-p.rate(), p.name))
+        raise ConfigError(
+            f"{root} holds results of several suites, physics or first rounds, expected one: move them apart."
+        )
+    return sorted(found, key=lambda p: (*(-rate for rate in p.rate()), p.name))
 
 
 def _parse(value: Any, file: Path) -> _Policy:
     """Return a results file as a policy, every value checked."""
+    if isinstance(value, dict) and (value.get("format"), value.get("version")) == (FORMAT, 1):
+        raise SchemaVersionError(
+            f"{file} is of format version 1, which does not say what the robot touched, expected version "
+            f"{FORMAT_VERSION}: play it again, navrep-data benchmark NAME --suite SUITE with another --out."
+        )
     try:
         if value["format"] != FORMAT or value["version"] != FORMAT_VERSION:
             raise ValueError(f"format {value['format']!r} version {value['version']!r}")
         columns, settings = value["episodes"], dict(value["settings"])
         n = len(value["outcome"])
         scenarios = columns["scenario"] or [""] * n
-        whole = {name: [int(v) for v in columns[name]] for name in ("steps", "seed")}
+        whole = {name: [int(v) for v in columns[name]] for name in ("steps", "seed", *CONTACTS)}
         special = {"seed", "scenario", "event", "steps"}
         metrics = {clip(k, 60): [_number(v) for v in column] for k, column in columns.items() if k not in special}
         lengths = {len(columns["event"]), len(scenarios), *map(len, whole.values()), *map(len, metrics.values())}
@@ -198,6 +211,7 @@ def _parse(value: Any, file: Path) -> _Policy:
             event=[e if (e := str(columns["event"][k])) in EVENT_NAMES else "none" for k in played],
             steps=[min(max(whole["steps"][k], 0), 1_000_000) for k in played],
             seed=[whole["seed"][k] for k in played],
+            touched=[int(any(whole[name][k] > 0 for name in CONTACTS)) for k in played],
             metrics={name: [column[k] for k in played] for name, column in metrics.items()},
             paths=_paths(value["trajectories_cm"], set(played)),
         )
@@ -255,6 +269,12 @@ def _build(
         "facts": [
             ["suite", clip(f"{settings.get('suite')}, {settings.get('physics')} physics")],
             ["played", f"{len(policies)} policies, {sum(len(p.number) for p in policies):,} episodes"],
+            ["first round", clip(settings.get("first_round", 0))],
+            [
+                "success",
+                "contact-free: the goal without touching anybody or anything; as released: by the rules of the "
+                "environment, which may allow contacts",
+            ],
             ["made with", clip(f"navrep-data {settings.get('navrep_data', '?')}")],
             ["file", clip(root.name)],
         ],
@@ -284,6 +304,7 @@ def _pack(policy: _Policy, kept: int, place: dict[str, int]) -> tuple[dict[str, 
         "event": policy.event,
         "steps": policy.steps,
         "seed": policy.seed,
+        "touched": policy.touched,
         "points": [len(chosen[k]) if k in chosen else 0 for k in policy.number],
         "metrics": policy.metrics,
     }

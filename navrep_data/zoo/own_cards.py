@@ -17,8 +17,8 @@ _LOOKED = (
 )
 _BLIND_PEOPLE = "In its training worlds about half of the people do not see the robot and walk into it."
 _BENCHMARK_HEAD = (
-    "suite", "physics", "episodes", "success (95 % interval)", "`goal` on the same episodes", "collision", "timeout",
-    "command",
+    "suite", "physics", "episodes (rounds)", "success, contact-free (95 % interval)", "success, as released",
+    "`goal` on the same episodes, both", "collision", "timeout", "contacts per km", "command",
 )  # fmt: skip
 _WORLD_MODEL_HEAD = (
     "split", "rows", "next frame MSE", "standing still", "next goal [m2]", "standing still", "reconstruction MSE",
@@ -31,13 +31,22 @@ def is_benchmark(entry: dict[str, Any]) -> bool:
     return "success_rate" in entry
 
 
+def share(entry: dict[str, Any], key: str, interval: bool = False) -> str:
+    """Return a share of a result in percent, "-" where it was not measured: contacts were not always recorded."""
+    if entry.get(key) is None:
+        return "-"
+    text = f"{entry[key]:.1%}"
+    return f"{text} ({entry[f'{key}_low']:.1%} to {entry[f'{key}_high']:.1%})" if interval else text
+
+
 def results(r: Record) -> str:
     """Return the tables of a record's results, each with command and baseline."""
     scores = [
         (
-            x["suite"], x["physics"], x["episodes"],
-            f"{x['success_rate']:.1%} ({x['success_rate_low']:.1%} to {x['success_rate_high']:.1%})",
-            f"{x['goal_success_rate']:.1%}", f"{x['collision_rate']:.1%}", f"{x['timeout_rate']:.1%}",
+            x["suite"], x["physics"], f"{x['episodes']} ({x['rounds']})" if "rounds" in x else x["episodes"],
+            share(x, "contact_free_rate", interval=True), share(x, "success_rate", interval=True),
+            f"{share(x, 'goal_contact_free_rate')} / {share(x, 'goal_success_rate')}",
+            share(x, "collision_rate"), share(x, "timeout_rate"), _number(x.get("contacts_per_km")),
             f"`{x['command']}`",
         )
         for x in r.results
@@ -53,9 +62,10 @@ def results(r: Record) -> str:
     ]  # fmt: skip
     parts = [table(_BENCHMARK_HEAD, scores)] if scores else []
     for x in r.results:
-        if "per_map" in x:
-            shares = ", ".join(f"{name} {share:.1%}" for name, share in x["per_map"].items())
-            parts.append(f"{x['suite']} per map: {shares}.")
+        for key, what in (("per_map_contact_free", "contact-free"), ("per_map", "as released")):
+            if key in x:
+                shares = ", ".join(f"{name} {value:.1%}" for name, value in x[key].items())
+                parts.append(f"{x['suite']} per map, {what}: {shares}.")
     if errors:
         data = sorted({f"{x['data']['name']} (content hash `{x['data']['content_hash'][:16]}`)" for x in r.results
                        if not is_benchmark(x)})  # fmt: skip

@@ -33,6 +33,8 @@ def test_json_is_one_object_with_results(played):
         assert (row["suite"], row["physics"], row["episodes"]) == ("navreptest", "original", 5)
         assert row["success_rate"] + row["collision_rate"] + row["timeout_rate"] == pytest.approx(1.0)
         assert row["goal_success_rate"] == found["results"][1]["success_rate"]
+        assert 0 <= row["contact_free_rate"] <= row["success_rate"]
+        assert {"contacts_per_km", "personal_space_share", "time_stopped", "goal_contact_free_rate"} <= set(row)
         assert row["success_rate_low"] <= row["success_rate"] <= row["success_rate_high"]
     for name in ("goal.json", "random.json", "report.md", "success.png", "trajectories.png"):
         assert (out / "navreptest-original" / name).stat().st_size > 0
@@ -47,7 +49,7 @@ def test_json_is_one_object_with_results(played):
 def test_redraw_prints_the_table(played):
     done = run("--redraw", played[0] / "navreptest-original", "--no-figures")
     assert done.returncode == 0, done.stderr
-    head, _, *lines = done.stdout.splitlines()
+    head, _, *lines = done.stdout.split("\n\n")[0].splitlines()
     assert all(column in head for column in ("policy", "sees", "physics", "episodes", "success", "`goal`"))
     assert {line.split()[1] for line in lines if line} == {"goal", "random"}
     assert "report.md" in done.stderr

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError
-from navrep_data.evaluate.metrics import METRICS
+from navrep_data.evaluate.metrics import METRICS, Contacts
 from navrep_data.evaluate.policies import PilotSpec
 from navrep_data.evaluate.reproduce import FIGURES, reproduce
 from navrep_data.evaluate.reproduce.drawn import authors
@@ -29,6 +29,10 @@ def results(folder, name, outcome, suite="navrep27", variant=None, physics="orig
     n = len(outcome)
     found.outcome, found.events, found.steps = list(outcome), ["goal"] * n, [10] * n
     found.metrics = {m.name: [1.0] * n for m in METRICS}
+    # every third success came after a contact
+    found.contacts = [
+        Contacts(human=int(c == "C" or (c == "S" and k % 3 == 0)), speed=0.3) for k, c in enumerate(outcome)
+    ]
     found.trajectories = {k: np.array([[0.0, 0.0], [1.0, 0.1 * k]]) for k in range(n)}
     home = folder / f"{suite}-{physics}"
     home.mkdir(parents=True, exist_ok=True)
@@ -109,19 +113,18 @@ def test_table_has_a_column_per_source_and_the_goal_beside(measured):
         for line in text.split("\n## ")[0].splitlines()
         if (cells := [c.strip() for c in line.split("|")])[1:]
     }
-    assert lines["policy"][:3] == [
-        "authors' own figure",
-        "released weights, measured by us",
-        "our weights, measured by us",
-    ]
+    assert lines["policy"][:5] == [
+        "authors' own figure (as released)",
+        "released weights, measured by us: contact-free", "as released",
+        "our weights, measured by us: contact-free", "as released",
+    ]  # fmt: skip
     row = lines["transformer_rings_z"]
     assert row[0] == "39.1 %"
-    assert row[1].startswith("11.1 % (")
-    assert row[2].startswith("77.8 % (")
-    assert row[3:] == ["-", "18.5 %"]
-    assert lines["e2e_1d"][1] == "50.0 % (33.3 to 66.7; 2 runs)"
-    assert "| transformer_rings_z | - | 60.0 % (" in text
-    assert "| 30.0 % |" in text
+    assert [cell.partition(" (")[0] for cell in row[1:5]] == ["7.4 %", "11.1 %", "51.9 %", "77.8 %"]
+    assert row[5:] == ["-", "-", "11.1 %", "18.5 %"]
+    assert lines["e2e_1d"][2] == "50.0 % (33.3 to 66.7; 2 runs)"
+    assert "| transformer_rings_z | - | - | 40.0 % (" in text
+    assert "| 20.0 % | 30.0 % |" in text
     assert "76 %" in text
 
 

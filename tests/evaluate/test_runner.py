@@ -147,8 +147,10 @@ def test_goal_is_played_beside_others_but_not_listed(tmp_path):
     report = benchmark(["random"], episodes=4, out=tmp_path, figures=False)
     assert [r["name"] for r in report.rows] == ["random"]
     assert report.baseline["name"] == "goal"
-    assert "| `goal` |" in report.text
-    assert report.to_dict()["results"][0]["goal_success_rate"] == report.baseline["success_rate"]
+    assert "| `goal`, both" in report.text
+    (row,) = report.to_dict()["results"]
+    assert row["goal_success_rate"] == report.baseline["success_rate"]
+    assert row["goal_contact_free_rate"] == report.baseline["contact_free_rate"]
 
 
 def test_changed_settings_are_refused_and_damaged_files_too(tmp_path):
@@ -187,7 +189,7 @@ def test_variants_with_several_runs_get_a_line_of_their_own(tmp_path):
     def made_up(name, outcome):
         results = Results(
             {"name": name, "sees": "scan", "variant": name.split(".")[0], "versions": {},
-             "settings": {"suite": "navreptest", "physics": "original", "inference": "deterministic"}}
+             "settings": {"suite": "navreptest", "physics": "original", "inference": "deterministic", "first_round": 0}}
         )  # fmt: skip
         results._grow(len(outcome))
         results.outcome = list(outcome)
@@ -213,6 +215,9 @@ def test_variants_with_several_runs_get_a_line_of_their_own(tmp_path):
         ({"policies": ["goal"], "physics": "real"}, ConfigError, "expected one of: original, consistent"),
         ({"policies": ["goal"], "episodes": 501}, ConfigError, "from 1 to 500 in navreptest"),
         ({"policies": ["goal"], "episodes": 0}, ConfigError, "episodes is 0"),
+        ({"policies": ["goal"], "first_round": 500}, ConfigError, "first_round is 500, expected .* 0 to 499"),
+        ({"policies": ["goal"], "first_round": -1}, ConfigError, "first_round is -1"),
+        ({"policies": ["goal"], "first_round": 450, "episodes": 51}, ConfigError, "at most 50 episodes from there"),
         ({"policies": ["goal"], "workers": 0}, ConfigError, "workers is 0"),
         ({"policies": ["goal"], "inference": "noisy"}, ConfigError, "expected one of: deterministic, as_released"),
         ({"policies": ["./nowhere"]}, ModelNotFoundError, "There is no .*nowhere"),

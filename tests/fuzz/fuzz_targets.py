@@ -505,7 +505,7 @@ def _read_model_list(folder: Path) -> None:
 def _make_results(folder: Path) -> None:
     import math
 
-    from navrep_data.evaluate.metrics import METRICS
+    from navrep_data.evaluate.metrics import METRICS, Contacts
     from navrep_data.evaluate.results import Results
     from navrep_data.evaluate.suites import get_suite
 
@@ -519,6 +519,7 @@ def _make_results(folder: Path) -> None:
     results.outcome = ["S" if e == "goal" else "T" if e == "timeout" else "C" for e in results.events]
     results.steps = list(range(5, 5 + n))
     results.metrics = {m.name: [1.5, math.nan, 2.0] * 2 for m in METRICS}
+    results.contacts = [Contacts(k % 2, k % 3, 0.5) for k in range(n)]
     results.trajectories = {k: np.arange(10.0).reshape(5, 2) for k in range(n)}
     results.save(folder / "results.json")
 

@@ -271,7 +271,8 @@ def test_benchmarks_reach_record_and_card_with_the_goal_beside(trained, package,
     assert entry["episodes"] == 3
     assert 0 <= entry["goal_success_rate"] <= 1
     card = own_cards.own_card(record)
-    assert "| navreptest | original | 3 |" in card
+    assert "| navreptest | original | 3 (0 to 2) |" in card
+    assert 0 <= entry["contact_free_rate"] <= entry["success_rate"]
     (tmp_path / "b" / "navreptest-original" / "goal.json").unlink()
     with pytest.raises(CorruptDataError, match="no results of 'goal'"):
         shipping.add_results(c.name, tmp_path / "b", root=package)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from view_pages import HOSTILE, Reader, write_results
 
-from navrep_data.errors import ConfigError, CorruptDataError, DatasetError, DatasetNotFoundError
+from navrep_data.errors import ConfigError, CorruptDataError, DatasetError, DatasetNotFoundError, SchemaVersionError
 from navrep_data.evaluate.metrics import METRICS
 from navrep_data.view import Scene, is_results, results_page
 from navrep_data.view.results import coarser
@@ -16,14 +16,19 @@ def test_a_page_holds_tables_and_trajectories(results):
     page = Reader(results_page(results).html)
     meta = page.meta
     assert sorted(p["name"] for p in meta["policies"]) == ["first", "second"]
-    rates = [p["columns"]["event"].count("goal") for p in meta["policies"]]
-    assert rates == sorted(rates, reverse=True)
+    rates = [
+        sum(e == "goal" and not t for e, t in zip(p["columns"]["event"], p["columns"]["touched"], strict=True))
+        for p in meta["policies"]
+    ]
+    assert rates == sorted(rates, reverse=True), "best first, by success without contact"
     assert [s["name"] for s in meta["scenarios"]] == ["place 0", "place 1", "place 2"]
     for policy in meta["policies"]:
         file = results / ("0.json" if policy["name"] == "first" else "1.json")
         source, columns = json.loads(file.read_text()), policy["columns"]
         assert columns["event"] == source["episodes"]["event"]
         assert columns["steps"] == source["episodes"]["steps"]
+        human, obstacle = source["episodes"]["contacts_human"], source["episodes"]["contacts_obstacle"]
+        assert columns["touched"] == [int(h + o > 0) for h, o in zip(human, obstacle, strict=True)]
         assert columns["scenario"] == [k % 3 for k in range(60)]
         xy, at = page.arrays(policy)["xy"], 0
         for number, points in zip(columns["number"], columns["points"], strict=True):
@@ -110,7 +115,8 @@ def _break(name, new):
 
 @pytest.mark.parametrize(
     "change",
-    [_break("version", 2), _break("format", "x"), _break("episodes", None), _break("episodes.steps", [1]),
+    [_break("version", 3), _break("episodes.contacts_human", None),
+     _break("format", "x"), _break("episodes", None), _break("episodes.steps", [1]),
      _break("episodes.seed", ["x"] * 60), _break("trajectories_cm.0", [1, 2, 3]), _break("outcome", 3),
      _break("trajectories_cm.0", [1e300, 1]), _break("trajectories_cm.x", [1, 2]), _break("settings", [1])],
 )  # fmt: skip
@@ -122,6 +128,13 @@ def test_damaged_results_are_refused_in_one_line(tmp_path, change):
     with pytest.raises(CorruptDataError, match="not a results file of this version") as caught:
         results_page(file)
     assert "\n" not in str(caught.value)
+
+
+def test_results_that_do_not_know_of_contacts_are_refused_with_the_command(tmp_path):
+    file = write_results(tmp_path / "r", "p")
+    file.write_text(json.dumps({**json.loads(file.read_text()), "version": 1}))
+    with pytest.raises(SchemaVersionError, match="play it again, navrep-data benchmark NAME --suite SUITE"):
+        results_page(file)
 
 
 def test_what_is_no_results(tmp_path, results, dataset):

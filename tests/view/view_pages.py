@@ -25,6 +25,9 @@ def write_results(folder: Path, name: str, *, n: int = 60, scenarios: int = 3, s
         "event": events,
         "steps": steps.tolist(),
         "path_length": rng.uniform(1, 20, n).round(5).tolist(),
+        "contacts_human": [int(e == "collision_human" or k % 5 == 0) for k, e in enumerate(events)],
+        "contacts_obstacle": [int(e == "collision_obstacle") for e in events],
+        "contact_speed": [0.5 if e.startswith("collision") or k % 5 == 0 else None for k, e in enumerate(events)],
         "time_to_goal": [float(s) if e == "goal" else None for s, e in zip(steps, events, strict=True)],
     }
     paths = {
@@ -32,8 +35,9 @@ def write_results(folder: Path, name: str, *, n: int = 60, scenarios: int = 3, s
         for k in range(n - 5)
     }
     value = {
-        "format": "navrep-data-benchmark", "version": 1, "name": name, "sees": "scan", "variant": "",
-        "settings": {"suite": "navrep27", "physics": "original", "inference": "deterministic", **settings},
+        "format": "navrep-data-benchmark", "version": 2, "name": name, "sees": "scan", "variant": "",
+        "settings": {"suite": "navrep27", "physics": "original", "inference": "deterministic", "first_round": 0}
+        | settings,
         "versions": {}, "outcome": "".join(letters.get(e, "C") for e in events), "episodes": columns,
         "trajectories_cm": paths,
     }  # fmt: skip

@@ -73,7 +73,8 @@ def test_results_are_shown_with_command_and_baseline(monkeypatch):
         "`navrep-data benchmark zoo:e2e_1d.20201026 --suite navreptest` |"
     ) in text
     one = next(r for r in measured if r.tag == "20201026")
-    assert "success 62.5%, `goal` on the same episodes 15.0%" in "\n".join(cards.describe(one))
+    words = "\n".join(cards.describe(one))
+    assert "success contact-free -, as released 62.5%; `goal` on the same episodes - and 15.0%" in words
 
 
 @pytest.mark.parametrize("name", sorted(registry.records()))

@@ -18,14 +18,19 @@ PARTS = ("all", *MAP_GROUPS)
 _MEASURED = ("released", "ours", "other", "baseline")
 _WIDTH = 0.27
 _AUTHORS_WAY = fed_as({"ranges": "as_released"})
+_PALE = 0.35
+"""Opacity of the success as released, behind that without contact."""
+_FREE = ("contact_free", "contact_free_low", "contact_free_high")
 Score = dict[str, Any]
 
 
 def scores(found: Sequence[Results]) -> dict[str, dict[str, dict[str, Score]]]:
-    """Return success by variant, source and part (all, maps).
+    """Return both successes by variant, source and part (all, maps).
 
     Several runs of a variant are one score, from the least to the greatest of them; a single one has Wilson's interval.
     Beside the authors' numbers stand runs of their networks that were fed as their software does it, where there are.
+    `value`, `low` and `high` are of the success as released, which is what the authors' numbers are of;
+    `contact_free`, `contact_free_low` and `contact_free_high` of that without contact.
     """
     fed: dict[tuple[str, str], dict[str, list[Results]]] = {}
     for results in found:
@@ -44,26 +49,30 @@ def scores(found: Sequence[Results]) -> dict[str, dict[str, dict[str, Score]]]:
     return merged
 
 
-def _count(results: Results, part: str = "all") -> tuple[int, int]:
-    """Return the episodes that reached the goal, and those played, of all scenarios or of one map's."""
+def _count(results: Results, part: str = "all") -> tuple[int, int, int]:
+    """Return the episodes that reached the goal, those without contact, and all, of all scenarios or of one map's."""
     suite = results.suite
-    letters = [
-        letter
+    played = [
+        k
         for k, letter in enumerate(results.outcome)
         if letter != NOT_PLAYED and part in ("all", suite.scenarios[suite.scenario(k)].map)
     ]
-    return letters.count("S"), len(letters)
+    free = sum(results.contact_free(k) for k in played)
+    return sum(results.outcome[k] == "S" for k in played), free, len(played)
 
 
 def _merge(runs: Sequence[Results], part: str) -> Score:
     counts = [_count(r, part) for r in runs]
-    names, episodes = [r.name for r in runs], sum(n for _, n in counts)
-    counts = [c for c in counts if c[1]]
-    if not counts:
-        return {"value": None, "low": None, "high": None, "runs": names, "episodes": episodes}
-    rates = [won / n for won, n in counts]
-    value, low, high = spread(rates) if len(rates) > 1 else (rates[0], *wilson(*counts[0]))
-    return {"value": value, "low": low, "high": high, "runs": names, "episodes": episodes}
+    names, episodes = [r.name for r in runs], sum(n for *_, n in counts)
+    counts = [c for c in counts if c[-1]]
+    found: Score = {}
+    for which, keys in enumerate((("value", "low", "high"), _FREE)):
+        ends: Sequence[float | None] = (None, None, None)
+        if counts:
+            rates = [c[which] / c[-1] for c in counts]
+            ends = spread(rates) if len(rates) > 1 else (rates[0], *wilson(counts[0][which], counts[0][-1]))
+        found |= dict(zip(keys, ends, strict=True))
+    return {**found, "runs": names, "episodes": episodes}
 
 
 def missing(folder: Path, suite: str, have: Sequence[str]) -> list[Missing]:
@@ -95,7 +104,7 @@ def _order(measured: dict[str, Any]) -> list[str]:
 
 
 def testing(folder: Path) -> Drawn:
-    """Draw success per variant, overall and per map, one bar per source."""
+    """Draw both successes per variant, overall and per map, a bar per source: filled contact-free, pale as released."""
     found = find_benchmarks(folder, "navrep27")
     lacks = missing(folder, "navrep27", _names(found))
     if not found:
@@ -108,9 +117,10 @@ def testing(folder: Path) -> Drawn:
     for ax, part in zip(axes, PARTS, strict=True):
         for i, variant in enumerate(order):
             _bars(ax, i, measured.get(variant, {}), authors()[part].get(variant), part)
-        level = goal.get(part, {}).get("value")
-        if level is not None:
-            ax.axhline(100 * level, color="black", linestyle="--", linewidth=0.8, zorder=1)
+        for key, style in (("contact_free", "--"), ("value", "-.")):
+            level = goal.get(part, {}).get(key)
+            if level is not None:
+                ax.axhline(100 * level, color="black", linestyle=style, linewidth=0.8, zorder=1)
         if part == "all":
             ax.axhline(100 * authors()["teb"]["success"], color="black", linestyle=":", linewidth=0.9, zorder=1)
         ax.set_ylim(0, 100)
@@ -138,19 +148,19 @@ def _bars(ax: Any, i: int, measured: dict[str, dict[str, Score]], theirs: float 
     for j, (source, score) in enumerate(entries):
         x = i + (j - (len(entries) - 1) / 2) * _WIDTH
         value = 100 * score["value"]
-        style: dict[str, Any] = {"color": COLOURS[source]}
+        style: dict[str, Any] = {"color": COLOURS[source], "alpha": _PALE}
         if source == "authors":  # an outline: it is not ours to vouch for
             style = {"facecolor": "white", "edgecolor": COLOURS[source], "hatch": HATCHES[source], "linewidth": 0.8}
         ax.bar(x, value, _WIDTH * 0.94, zorder=2, **style)
-        top = value
+        top, text = value, f"{value:.0f}"
         if source != "authors":
-            top = 100 * score["high"]
-            error = [[max(0.0, value - 100 * score["low"])], [max(0.0, top - value)]]
-            ax.errorbar(x, value, error, color="black", capsize=2, linewidth=0.8, zorder=3)
+            free, low, high = (100 * score[key] for key in _FREE)
+            ax.bar(x, free, _WIDTH * 0.94, color=COLOURS[source], zorder=2)
+            ax.errorbar(x, free, [[max(0.0, free - low)], [max(0.0, high - free)]], color="black", capsize=2,
+                        linewidth=0.8, zorder=3)  # fmt: skip
+            top, text = max(high, value), f"{free:.0f}/{value:.0f}"
         box = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75}
-        ax.annotate(
-            f"{value:.0f}", (x, top), (0, 2), textcoords="offset points", ha="center", fontsize=6, bbox=box, zorder=4
-        )
+        ax.annotate(text, (x, top), (0, 2), textcoords="offset points", ha="center", fontsize=5.5, bbox=box, zorder=4)
 
 
 def _legend(figure: Any, kinds: Sequence[str], goal: bool) -> None:
@@ -162,7 +172,10 @@ def _legend(figure: Any, kinds: Sequence[str], goal: bool) -> None:
     ]
     handles += [Patch(color=COLOURS[kind], label=label(kind)) for kind in kinds]
     if goal:
-        handles.append(Line2D([], [], color="black", linestyle="--", linewidth=0.8, label="goal, measured by us"))
+        for style, what in (("--", "contact-free"), ("-.", "as released")):
+            handles.append(
+                Line2D([], [], color="black", linestyle=style, linewidth=0.8, label=f"goal, {what}, measured by us")
+            )
     handles.append(Line2D([], [], color="black", linestyle=":", linewidth=0.9, label="TEB planner, the paper's text"))
     figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8, frameon=False)
 
@@ -173,8 +186,9 @@ def _note(found: Sequence[Results]) -> str:
     seen = sorted({f"{r.name} sees {r.header['sees']}" for r in found if source_of(r.header["name"]) == "baseline"})
     baselines = f" {'; '.join(seen)}." if seen else ""
     return (
-        f"Measured: {each} episodes per policy, original physics; intervals of 95 % (Wilson), or least to greatest of "
-        "several runs. The authors' bars are read off their figure (+-0.5), theirs are of other episodes."
+        f"Measured: {each} episodes per policy, original physics. Filled: success without contact, with intervals of "
+        "95 % (Wilson) or least to greatest of several runs; pale: success as released.\nThe authors' bars are read "
+        "off their figure (+-0.5): of other episodes, and to be held against success as released."
         + (f"\n{baselines.strip()}" if baselines else "")
     )
 
@@ -203,7 +217,8 @@ def trajectories(folder: Path) -> Drawn:
     lacks = missing(folder, "navrep27", _names(found))
     if not found:
         return Drawn(missing=lacks)
-    rate = {r.name: _merge([r], "all")["value"] or 0.0 for r in found}
+    scored = {r.name: _merge([r], "all") for r in found}
+    rate = {name: score["contact_free"] or 0.0 for name, score in scored.items()}
     ranked = sorted(found, key=lambda r: -rate[r.name])
     most = {"ours": 3, "released": 3, "other": 1, "baseline": 1}
     chosen: list[Results] = []
@@ -211,7 +226,11 @@ def trajectories(folder: Path) -> Drawn:
         chosen += [r for r in ranked if source_of(r.header["name"]) == source][:n]
     chosen = chosen[:MAX_ROWS]
     labels = [f"{r.name}\n({label(source_of(r.header['name'])).split(',')[0]})" for r in chosen]
-    sources = [{"name": r.name, "source": source_of(r.header["name"]), "success_rate": rate[r.name]} for r in chosen]
+    sources = [
+        {"name": r.name, "source": source_of(r.header["name"]), "contact_free_rate": rate[r.name],
+         "success_rate": scored[r.name]["value"] or 0.0}
+        for r in chosen
+    ]  # fmt: skip
     return Drawn(comparison(chosen, labels), sources=sources, missing=lacks)
 
 
@@ -239,18 +258,21 @@ def table(folder: Path) -> Drawn:
             sources += rows
     teb = authors()["teb"]
     parts.append(
-        f"Success. {label('authors').capitalize()}: {authors()['source']}; other episodes than ours. Measured: in "
-        "original physics; one run with its 95 % interval, several with mean and least to greatest. TEB: "
-        f"{100 * teb['success']:.0f} % in the 27 scenarios ({teb['source']})."
+        "Success: contact-free (the goal without touching anybody or anything), then as released (by the rules of the "
+        "environment, which allow contacts in the 27 scenarios). "
+        f"{label('authors').capitalize()}: {authors()['source']}; as released, of other episodes than ours. Measured: "
+        "in original physics; one run with its 95 % interval, several with mean and least to greatest. TEB: "
+        f"{100 * teb['success']:.0f} % in the 27 scenarios, as released ({teb['source']})."
     )
     return Drawn(text="\n\n".join(parts) + "\n", sources=sources, missing=lacks)
 
 
 def _one_table(suite: str, measured: dict[str, dict[str, dict[str, Score]]]) -> tuple[str, list[dict[str, Any]]]:
     theirs = authors()["all"] if suite == "navrep27" else {}
-    goal = _cell(measured.get("goal", {}).get("baseline", {}).get("all"), interval=False)
-    head = ["policy", *([label("authors")] if theirs else [])]
-    head += [label("released"), label("ours"), "baselines and others, measured by us", "`goal`, same episodes"]
+    goal = _cells(measured.get("goal", {}).get("baseline", {}).get("all"), interval=False)
+    head = ["policy", *([f"{label('authors')} (as released)"] if theirs else [])]
+    for what in (label("released"), label("ours"), "baselines and others, measured by us", "`goal`, same episodes"):
+        head += [f"{what}: contact-free", "as released"]
     lines = [head, ["---"] * len(head)]
     sources: list[dict[str, Any]] = []
     for variant in [v for v in _order(measured) if v in theirs or v in measured]:
@@ -259,20 +281,25 @@ def _one_table(suite: str, measured: dict[str, dict[str, dict[str, Score]]]) -> 
             cells.append(f"{100 * theirs[variant]:.1f} %" if variant in theirs else "-")
         for kinds in _COLUMNS.values():
             of = next((measured[variant][k] for k in kinds if k in measured.get(variant, {})), None)
-            cells.append(_cell(None if of is None else of["all"]))
+            cells += _cells(None if of is None else of["all"])
         sources += [{"name": variant, "suite": suite, "source": k, **of["all"]}
                     for k, of in measured.get(variant, {}).items()]  # fmt: skip
         if variant in theirs:
             sources.append({"name": variant, "suite": suite, "source": "authors", "value": theirs[variant]})
-        lines.append([*cells, goal])
+        lines.append([*cells, *goal])
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines), sources
 
 
-def _cell(score: Score | None, interval: bool = True) -> str:
-    if score is None or score["value"] is None:
+def _cells(score: Score | None, interval: bool = True) -> list[str]:
+    """Return the texts of the success without contact and of that as released."""
+    return [_cell(score, *keys, interval) for keys in (_FREE, ("value", "low", "high"))]
+
+
+def _cell(score: Score | None, value: str, low: str, high: str, interval: bool) -> str:
+    if score is None or score[value] is None:
         return "-"
-    text = f"{100 * score['value']:.1f} %"
+    text = f"{100 * score[value]:.1f} %"
     if not interval:
         return text
-    text += f" ({100 * score['low']:.1f} to {100 * score['high']:.1f}"
+    text += f" ({100 * score[low]:.1f} to {100 * score[high]:.1f}"
     return text + (f"; {len(score['runs'])} runs)" if len(score["runs"]) > 1 else ")")

@@ -14,6 +14,8 @@ function place(episode, step) {
 }
 
 const shown = () => state.episodes.filter((e) => e.points > 0 && !state.hidden.has(known(e.event)));
+const afterContact = (e) => known(e.event) === 'goal' && e.touched > 0;
+const outcomeText = (e) => OUTCOME_TEXT[known(e.event)] + (afterContact(e) ? ' after contact' : '');
 const count = (episodes, name) => episodes.filter((e) => known(e.event) === name).length;
 
 function bounds() {
@@ -79,12 +81,14 @@ function drawMap(ctx, w, h) {
     ctx.strokeStyle = ctx.fillStyle = outcomeColour(e.event);
     ctx.globalAlpha = faint ? 0.12 : chosen ? 1 : 0.7;
     ctx.lineWidth = chosen ? 3 : 1.5;
+    ctx.setLineDash(afterContact(e) ? [5, 4] : []);
     ctx.beginPath();
     const now = atEnd ? e.points - 1 : Math.floor(Math.min(step / Math.max(e.steps, 1), 1) * (e.points - 1));
     for (let k = e.at; k <= e.at + now; k++) ctx.lineTo(camera.x(state.arrays.xy.value(0, k)), camera.y(state.arrays.xy.value(1, k)));
     const [x, y] = place(e, atEnd ? Infinity : step).map((v, axis) => (axis ? camera.y(v) : camera.x(v)));
     ctx.lineTo(x, y);
     ctx.stroke();
+    ctx.setLineDash([]);
     disc(ctx, camera.x(state.arrays.xy.value(0, e.at)), camera.y(state.arrays.xy.value(1, e.at)), 3);
     ctx.stroke();
     mark(ctx, x, y, chosen ? 6 : 4, atEnd || step >= e.steps ? known(e.event) : 'moving');
@@ -121,7 +125,7 @@ function showChosen() {
   const e = state.episodes.find((one) => one.number === state.chosen);
   $('badge').hidden = !e;
   if (e) {
-    $('badge').textContent = `episode ${e.number}: ${OUTCOME_TEXT[known(e.event)]}`;
+    $('badge').textContent = `episode ${e.number}: ${outcomeText(e)}`;
     $('badge').style.borderColor = outcomeColour(e.event);
     const kept = e.points ? '' : ' · its trajectory was not kept';
     $('state').textContent = [`seed ${e.seed}`, `${e.steps} steps`, ...e.metrics.map(metricText)].join(' · ') + kept;
@@ -152,9 +156,10 @@ function shareBar(episodes) {
 }
 
 function rowButton(text, episodes, pressed, onclick) {
-  const goals = count(episodes, 'goal'), rate = episodes.length ? `${(100 * goals / episodes.length).toFixed(1)} %` : '–';
+  const percent = (n) => (episodes.length ? (100 * n / episodes.length).toFixed(1) : '–');
+  const goals = count(episodes, 'goal'), free = goals - episodes.filter(afterContact).length;
   return el('button', { type: 'button', class: 'rowbutton', 'aria-pressed': pressed, onclick }, el('span', {}, text),
-    el('small', {}, `${rate} of ${episodes.length}`), shareBar(episodes));
+    el('small', { title: 'success contact-free, and as released' }, `${percent(free)} / ${percent(goals)} % of ${episodes.length}`), shareBar(episodes));
 }
 
 const ofScenario = (policy, scenario) => policy.table.filter((e) => e.scenario === scenario);
@@ -163,7 +168,7 @@ function buildLists() {
   $('policies').replaceChildren(...meta.policies.map((policy, k) => rowButton(policy.name, policy.table, k === state.policy, () => select(k, state.scenario))));
   $('scenarios').replaceChildren(...meta.scenarios.map((scenario, k) => rowButton(scenario.name, ofScenario(meta.policies[state.policy], k), k === state.scenario, () => select(state.policy, k))));
   $('timeline').replaceChildren(...state.episodes.map((e) => {
-    const text = `Episode ${e.number}: ${OUTCOME_TEXT[known(e.event)]}, ${e.steps} steps`;
+    const text = `Episode ${e.number}: ${outcomeText(e)}, ${e.steps} steps`;
     const button = el('button', { type: 'button', 'aria-label': text, title: text, 'data-episode': e.number, colour: outcomeColour(e.event), onclick: () => choose(e.number) }, state.episodes.length > 80 ? '' : OUTCOME_LETTER[known(e.event)]);
     button.style.flex = '1 1 0';
     return button;
@@ -173,7 +178,8 @@ function buildLists() {
     type: 'button', 'aria-pressed': !state.hidden.has(name), title: 'Show or hide',
     onclick: () => { if (!state.hidden.delete(name)) state.hidden.add(name); buildLists(); },
   }, OUTCOME_TEXT[name])));
-  $('outcomes').replaceChildren(...there.map((name) => key(outcomeColour(name), `${OUTCOME_LETTER[name]} ${OUTCOME_TEXT[name]} ${count(state.episodes, name)}`)));
+  const touched = state.episodes.filter(afterContact).length;
+  $('outcomes').replaceChildren(...there.map((name) => key(outcomeColour(name), `${OUTCOME_LETTER[name]} ${OUTCOME_TEXT[name]} ${count(state.episodes, name)}${name === 'goal' && touched ? ` (dashed: ${touched} after contact)` : ''}`)));
   showChosen();
 }
 
@@ -198,7 +204,7 @@ function readTables() {
     let at = 0;
     policy.table = c.number.map((number, k) => {
       const metrics = Object.entries(c.metrics).map(([name, values]) => [name, values[k]]).filter(([, value]) => value !== null);
-      const e = { number, scenario: c.scenario[k], event: c.event[k], steps: c.steps[k], seed: c.seed[k], points: c.points[k], at, metrics };
+      const e = { number, scenario: c.scenario[k], event: c.event[k], steps: c.steps[k], seed: c.seed[k], touched: c.touched[k], points: c.points[k], at, metrics };
       at += e.points;
       return e;
     });
