@@ -173,7 +173,9 @@ def _difference(pair: Row, name: str, scenarios: bool) -> str:
         return "-"
     text = f"{100 * value:+.1f}"
     low, high = (pair.get(f"{name}_difference_scenarios_{end}") for end in ("low", "high"))
-    return f"{text} ({100 * low:+.1f} to {100 * high:+.1f})" if scenarios and low is not None else text
+    if not scenarios or low is None or high is None:
+        return text
+    return f"{text} ({100 * low:+.1f} to {100 * high:+.1f})"
 
 
 def _discordant(pair: Row, name: str) -> str:
