@@ -67,6 +67,7 @@ def slow(positions, human, static, dt, success, shortest):
         "spl": shortest / max(shortest, length) if success else 0.0,
         "min_clearance": min(min(human), min(static)),
         "personal_space_time": sum(dt for gap in human[1:] if gap < 0.2),
+        "time_stopped": sum(dt for a, b in pairwise(positions) if math.dist(a, b) / dt < 0.05),
         "mean_jerk": sum(j) / len(j),
     }
 
@@ -75,7 +76,7 @@ def slow(positions, human, static, dt, success, shortest):
 def test_random_walks_against_plain_loops(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(4, 40))
-    path = np.cumsum(rng.normal(0, 0.1, (n, 2)), axis=0)
+    path = np.cumsum(rng.normal(0, 0.1, (n, 2)) * rng.integers(0, 2, (n, 1)), axis=0)
     human, static = rng.uniform(-0.1, 1.0, (2, n))
     found = measure(path, human, static, DT, bool(seed % 2), 1.5)
     expected = slow(path.tolist(), human.tolist(), static.tolist(), DT, bool(seed % 2), 1.5)
