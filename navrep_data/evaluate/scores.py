@@ -69,10 +69,9 @@ def _by_scenario(results: Results, of: NDArray[np.float64]) -> tuple[NDArray[np.
     """Return the sums of a number per episode, NaN where it was not played, and of episodes, per scenario."""
     scenario = np.arange(len(of)) % len(results.suite.scenarios)
     played = ~np.isnan(of)
-    sums, counts = (
-        np.bincount(scenario[played], weights, len(results.suite.scenarios))
-        for weights in (of[played], np.ones(int(played.sum())))
-    )
+    size = len(results.suite.scenarios)
+    sums = np.bincount(scenario[played], of[played], size).astype(np.float64)
+    counts = np.bincount(scenario[played], minlength=size).astype(np.float64)
     return sums[counts > 0], counts[counts > 0]
 
 

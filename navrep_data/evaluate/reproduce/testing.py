@@ -172,7 +172,8 @@ def _legend(figure: Any, kinds: Sequence[str], goal: bool) -> None:
     ]
     handles += [Patch(color=COLOURS[kind], label=label(kind)) for kind in kinds]
     if goal:
-        for style, what in (("--", "contact-free"), ("-.", "as released")):
+        lines: list[tuple[Any, str]] = [("--", "contact-free"), ("-.", "as released")]
+        for style, what in lines:
             handles.append(
                 Line2D([], [], color="black", linestyle=style, linewidth=0.8, label=f"goal, {what}, measured by us")
             )
