@@ -13,7 +13,9 @@ from navrep_data.cli._common import print_json, say
 def import_npz_command(
     files: Annotated[
         list[Path],
-        typer.Argument(metavar="FILE...", help="The original's *_scans_robotstates_actions_rewards_dones.npz."),
+        typer.Argument(
+            metavar="FILE...", help="*_scans_robotstates_actions_rewards_dones.npz of the original, or folders."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Dataset folder, new or empty.")],
     env: Annotated[str, typer.Option("--env", help="Name to record as the environment.")] = "imported",

@@ -54,12 +54,15 @@ TIMEOUT_ROWS = 176
 
 Dtypes = frozenset[np.dtype[Any]]
 _FLOATS: Dtypes = frozenset({np.dtype("f4"), np.dtype("f8")})
+# The original's simulators write bool; its tool for bags (navrep/tools/data_extraction.py) whole numbers, and float64
+# scans.
+_FLAGS: Dtypes = frozenset(map(np.dtype, ("?", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8")))
 _EXPECTED: dict[str, tuple[tuple[int, ...], Dtypes]] = {
-    "scans": ((N_RAYS,), frozenset({np.dtype("f4")})),
+    "scans": ((N_RAYS,), _FLOATS),
     "robotstates": ((ROBOT_STATE_SIZE,), _FLOATS),
     "actions": ((ACTION_SIZE,), _FLOATS),
     "rewards": ((), _FLOATS),
-    "dones": ((), frozenset({np.dtype("?")})),
+    "dones": ((), _FLAGS),
 }
 _COLUMNS = tuple(name for name in COLUMNS if name != "humans")
 
@@ -86,7 +89,7 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path, read: bool) -> tuple
                 f"{path}: array {name!r} holds pickled objects, which are never loaded; expected numbers."
             )
         if len(seen) != 1 + len(shape) or seen[1:] != shape or dtype not in dtypes or fortran:
-            wanted = " or ".join(sorted(str(d) for d in dtypes))
+            wanted = "bool or 0 and 1 as integers" if name == "dones" else " or ".join(sorted(str(d) for d in dtypes))
             raise CorruptDataError(f"{path}: array {name!r} is {dtype} {seen}, expected {wanted} {('rows', *shape)}.")
         if not 1 <= seen[0] <= MAX_ROWS:
             raise DatasetError(f"{path}: array {name!r} has {seen[0]:,} rows, expected 1 to {MAX_ROWS:,} per file.")
@@ -100,7 +103,7 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path, read: bool) -> tuple
         data = handle.read(size)
         if len(data) != size:
             raise CorruptDataError(
-                f"{path}: array {name!r} ends after {len(data):,} of {size:,} bytes. Get the file again."
+                f"{path}: array {name!r} ends after {len(data):,} of {size:,} bytes. Write or copy the file again."
             )
         handle.read(1)  # reaching the end makes zipfile check the CRC
         return seen[0], np.frombuffer(data, dtype).reshape(seen)
@@ -118,7 +121,8 @@ def _load(path: Path, read: bool = True) -> tuple[int, Arrays]:
         raise
     except Exception as error:  # damaged archives raise a dozen kinds, struct.error and zlib.error among them
         raise CorruptDataError(
-            f"{path} cannot be read as npz ({error}). Expected a file of the original software; get it again."
+            f"{path} cannot be read as npz ({error}). Expected a file of the original software: "
+            "is it written or copied completely?"
         ) from error
     rows = {count for count, _ in found.values()}
     if len(rows) != 1:
@@ -129,21 +133,21 @@ def _load(path: Path, read: bool = True) -> tuple[int, Arrays]:
 
 def _find(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
     """Return the files to import, in order."""
-    if not isinstance(source, str | os.PathLike):
-        files = [Path(item) for item in source]
-    elif Path(source).is_dir():
-        files = sorted(Path(source).glob(f"*{FILE_SUFFIX}"))
-    else:
-        files = [Path(source)]
+    items = [Path(source)] if isinstance(source, str | os.PathLike) else [Path(item) for item in source]
+    found = [sorted(path.glob(f"*{FILE_SUFFIX}")) if path.is_dir() else [path] for path in items]
+    files = [path for paths in found for path in paths]
     missing = [path for path in files if not path.is_file()]
-    if missing or not files:
-        seen = f"There is no file {missing[0]}" if missing else f"There is nothing to import in {source}"
+    if missing or not all(found) or not files:
+        empty = next((path for path, paths in zip(items, found, strict=True) if not paths), source)
+        seen = f"There is no file {missing[0]}" if missing else f"There is nothing to import in {empty}"
         raise DatasetNotFoundError(f"{seen}; expected files named NNN_{FILE_SUFFIX}, or a folder of them.")
     return files
 
 
 def _clean_scans(scans: npt.NDArray[Any], range_max: float, path: Path) -> npt.NDArray[np.float32]:
-    """Return ranges in [0, range_max] [m] with 0 for what is no range."""
+    """Return ranges in [0, range_max] [m] with 0 where nobody saw anything (NaN, negative)."""
+    with np.errstate(over="ignore"):  # no float32 either: refused below as too far
+        scans = scans.astype(np.float32, copy=False)
     scans = np.where(np.isposinf(scans), np.float32(range_max), scans)
     scans = np.where(np.isnan(scans) | (scans < 0), np.float32(0.0), scans)
     if scans.max() > np.float32(range_max):
@@ -242,7 +246,10 @@ def _sequence(path: Path, sequence: int, range_max: float, rings: bool) -> Array
     states = arrays["robotstates"]
     if np.isinf(states).any() or np.isnan(states[:, 2:]).any():
         raise CorruptDataError(f"{path}: array 'robotstates' holds inf or NaN velocities, expected NaN in goals only.")
-    columns = align(arrays, sequence)
+    dones = arrays["dones"]
+    if dones.dtype != np.bool_ and not np.isin(dones, (0, 1)).all():
+        raise CorruptDataError(f"{path}: array 'dones' holds {dones.max()} and {dones.min()}, expected 0 and 1 only.")
+    columns = align({**arrays, "dones": dones.astype(np.bool_)}, sequence)
     columns["scan"] = _clean_scans(arrays["scans"], range_max, path)
     if rings:
         columns["rings"] = scan_to_rings(columns["scan"])
@@ -264,8 +271,8 @@ def import_npz(
     Parameters
     ----------
     source : path-like or iterable of path-like
-        Folder of ``NNN_scans_robotstates_actions_rewards_dones.npz`` files, one such file, or several. Each
-        becomes a sequence, in the order given (folders: by name).
+        Folder of ``NNN_scans_robotstates_actions_rewards_dones.npz`` files, one such file, or several of either. Each
+        file becomes a sequence, in the order given (folders: by name).
     out : path-like
         New dataset folder; must not exist, or be empty.
     env : str
@@ -297,10 +304,11 @@ def import_npz(
 
     Notes
     -----
-    Source: navrep/scripts/make_vae_dataset.py. A row of the original holds the action and reward that *led
+    Source: navrep/scripts/make_vae_dataset.py, and navrep/tools/data_extraction.py, whose scans are float64 and whose
+    ``dones`` are whole numbers. A row of the original holds the action and reward that *led
     to* it and no episode's first observation. Here ``action`` and ``reward`` of a row are those of the next
     row of its episode, and 0 on its last row; the original's stay in ``leading_action`` and
-    ``leading_reward``. Scans stay float32 in metres; NaN and negative ranges become 0 (invalid), +inf becomes
+    ``leading_reward``. Scans are float32 in metres; NaN and negative ranges become 0 (nobody saw), +inf becomes
     `range_max`. Poses, radii and humans are not in the source.
 
     Where its robot is stuck, the original ends the episode with one frame of another episode that is never
