@@ -146,7 +146,7 @@ def _find(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> 
 
 def _clean_scans(scans: npt.NDArray[Any], range_max: float, path: Path) -> npt.NDArray[np.float32]:
     """Return ranges in [0, range_max] [m] with 0 where nobody saw anything (NaN, negative)."""
-    with np.errstate(over="ignore"):  # no float32 either: refused below as too far
+    with np.errstate(over="ignore"):  # farther than any float32: as inf, nothing was hit
         scans = scans.astype(np.float32, copy=False)
     scans = np.where(np.isposinf(scans), np.float32(range_max), scans)
     scans = np.where(np.isnan(scans) | (scans < 0), np.float32(0.0), scans)
