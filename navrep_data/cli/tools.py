@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from navrep_data.cli._common import print_json, progress_bar, say
+from navrep_data.cli._common import print_json, progress_bar, say, say_err
 
 if TYPE_CHECKING:
     from navrep_data.shards import Manifest
@@ -191,13 +191,21 @@ def import_rosbag_command(
     env: Annotated[str, typer.Option("--env", help="Name to record as the environment.")] = "rosbag",
     dt: Annotated[float, typer.Option("--dt", help="Time between rows \\[s].")] = 0.2,
     length: Annotated[int, typer.Option("--length", help="Most rows of a sequence.")] = 1000,
-    range_max: Annotated[float, typer.Option("--range-max", help="Largest range to store \\[m].")] = 25.0,
+    range_max: Annotated[
+        float | None,
+        typer.Option(
+            "--range-max", help="Largest range to store; the scanner's if it does not say \\[m].", show_default="25"
+        ),
+    ] = None,
     mount: Annotated[str, typer.Option("--mount", help="Scanner on the robot: x,y,yaw \\[m, m, rad].")] = "0,0,0",
     goal_radius: Annotated[
         float, typer.Option("--goal-radius", help="A goal is reached nearer than this \\[m].")
     ] = 0.5,
     assume_same_frame: Annotated[
         bool, typer.Option("--assume-same-frame", help="Goals and odometry are in one frame, whatever it is called.")
+    ] = False,
+    invalid_is_free: Annotated[
+        bool, typer.Option("--invalid-is-free", help="NaN and 0 in scans mean that nothing was hit.")
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -210,6 +218,6 @@ def import_rosbag_command(
         manifest = import_rosbag(
             bags, out, scan_topic=scan_topic, odometry_topic=odometry_topic, goal_topic=goal_topic, env=env, dt=dt,
             length=length, range_max=range_max, mount=place, goal_radius=goal_radius,
-            assume_same_frame=assume_same_frame, progress=progress,
+            assume_same_frame=assume_same_frame, invalid_is_free=invalid_is_free, progress=progress, note=say_err,
         )  # fmt: skip
     _finish(manifest, out, as_json)

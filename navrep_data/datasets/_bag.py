@@ -1,47 +1,50 @@
 """ROS bags, read through the ``rosbags`` library: which topics, where the robot was, when scans came.
 
-Times are those at which messages were recorded: one clock for all topics, which stamps in headers are not.
+Only topics that are used are decoded, by the definitions of ROS itself, which never changed for them: what others
+hold, and how it is defined, does not matter.
 """
 
 from __future__ import annotations
 
 import contextlib
+import heapq
 import importlib
-import io
 import math
-import os
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from navrep_data.datasets._bag_clock import SECOND, Clock, choose_clock
+from navrep_data.datasets._bag_frames import TF_TOPICS, TF_TYPES, Frames, yaw_of
+from navrep_data.datasets._bag_repair import explained, open_readers
+from navrep_data.datasets._bag_scans import ScannerBook
 from navrep_data.errors import (
     ConfigError,
     CorruptDataError,
     DatasetError,
     DatasetNotFoundError,
     MissingExtraError,
-    NavrepDataError,
     did_you_mean,
 )
 from navrep_data.observations import Lidar
 
 SCAN_TYPE, ODOMETRY_TYPE = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
-GOAL_TYPE = "geometry_msgs/msg/PoseStamped"
+GOAL_TYPE, TF_TYPE = "geometry_msgs/msg/PoseStamped", TF_TYPES[0]
 NO_TOPIC = "none"
 # What the original's recorded data were read from, where a bag has several.
 USUAL_SCAN_TOPIC = "/combined_scan"
-MAX_RAYS = 100_000
 # Goals nearer to each other than this are one goal, published again [m].
 SAME_GOAL = 1e-3
 _LISTED = 12
 
-_PlainPath: Any = type(Path())
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Note = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -54,17 +57,45 @@ class Topics:
 
 
 @dataclass(frozen=True)
+class Reading:
+    """How a bag is to be read.
+
+    Attributes
+    ----------
+    mount : sequence of float
+        x, y [m] and yaw [rad] of the scanner, robot frame.
+    reach : float, optional
+        Range from which on nothing was hit [m], where the scans do not say.
+    invalid_is_free : bool
+        Whether NaN and 0 in scans mean that nothing was hit.
+    assume_same_frame : bool
+        Whether goals and odometry are in one frame although their names differ.
+    """
+
+    mount: Sequence[float]
+    reach: float | None
+    invalid_is_free: bool
+    assume_same_frame: bool
+
+
+@dataclass(frozen=True)
 class Tracks:
     """Everything in a bag but the ranges.
 
     Attributes
     ----------
     scan_times : ndarray of shape (S,), int64
-        When each scan was recorded [ns], ascending.
+        When each scan was made [ns], ascending.
+    scan_numbers : ndarray of shape (S,), int64
+        Which of the scans of the topic it is, in the order of recording.
     lidar : Lidar
-        The scanner, in its place on the robot.
+        The scanner as most scans describe it, in its place on the robot.
+    book : ScannerBook
+        Describes each scan.
+    clock : Clock
+        What times are.
     times : ndarray of shape (N,), int64
-        When each odometry message was recorded [ns], ascending.
+        When the robot was there [ns], ascending.
     pose : ndarray of shape (N, 3)
         x, y [m], theta [rad] in the odometry's frame.
     twist : ndarray of shape (N, 3)
@@ -76,7 +107,10 @@ class Tracks:
     """
 
     scan_times: Ints
+    scan_numbers: Ints
     lidar: Lidar
+    book: ScannerBook
+    clock: Clock
     times: Ints
     pose: Floats
     twist: Floats
@@ -84,23 +118,12 @@ class Tracks:
     goals: Floats
 
 
-class _SizedFile(io.BufferedReader):
-    """A file that is never asked for more bytes than are left: memory is set aside for whatever a header claims."""
+class _Topic(NamedTuple):
+    """A topic of a bag: its type, its messages, its connections by reader."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(io.FileIO(path))
-        self._size = os.fstat(self.fileno()).st_size
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        left = max(self._size - self.tell(), 0)
-        return super().read(left if size is None or size < 0 else min(size, left))
-
-
-class _BagPath(_PlainPath):  # type: ignore[misc]
-    """A path that opens such files; rosbags takes any path that has the methods of one."""
-
-    def open(self, mode: str = "r", *arguments: Any, **named: Any) -> Any:
-        return _SizedFile(self) if mode == "rb" else super().open(mode, *arguments, **named)
+    msgtype: str
+    messages: int
+    connections: dict[int, list[Any]]
 
 
 class Bag:
@@ -112,6 +135,8 @@ class Bag:
         The bag.
     scan, odometry, goal : str, optional
         Topics; chosen where only one fits. ``"none"`` as `goal` for none.
+    note : callable
+        Called with lines about what was left out or read in another way than usual.
 
     Attributes
     ----------
@@ -119,13 +144,13 @@ class Bag:
         Those that are used.
     """
 
-    def __init__(self, path: Path, scan: str | None, odometry: str | None, goal: str | None) -> None:
-        self.path = path
+    def __init__(self, path: Path, scan: str | None, odometry: str | None, goal: str | None, note: Note) -> None:
+        self.path, self._note = path, note
         self._stack = contextlib.ExitStack()
-        self._reader = self._open()
         try:
-            with self._explained():
-                self._there = {n: t for n, t in self._reader.topics.items() if t.msgcount}
+            self._readers = self._open()
+            with explained(path):
+                self._there = self._list_topics()
             self.topics = Topics(
                 self._choose(scan, SCAN_TYPE, "--scan-topic", USUAL_SCAN_TOPIC),
                 self._choose(odometry, ODOMETRY_TYPE, "--odometry-topic", ""),
@@ -141,29 +166,38 @@ class Bag:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def _open(self) -> Any:
+    def _open(self) -> list[Any]:
         try:
-            highlevel, types = importlib.import_module("rosbags.highlevel"), importlib.import_module("rosbags.typesys")
+            importlib.import_module("rosbags.highlevel")
+            ros1, ros2 = importlib.import_module("rosbags.rosbag1"), importlib.import_module("rosbags.rosbag2")
+            types = importlib.import_module("rosbags.typesys")
         except ImportError:
             raise MissingExtraError("rosbags is not installed; get it: pip install 'navrep-data[ros]'") from None
         if not self.path.exists():
             raise DatasetNotFoundError(f"There is no {self.path}; expected a ROS 1 .bag or the folder of a ROS 2 bag.")
-        with self._explained():
-            # bags of older ROS 2 do not say what their messages look like; those used here never changed
-            store = types.get_typestore(types.Stores.ROS2_HUMBLE)
-            return self._stack.enter_context(highlevel.AnyReader([_BagPath(self.path)], default_typestore=store))
-
-    @contextlib.contextmanager
-    def _explained(self) -> Iterator[None]:
-        try:
-            yield
-        except NavrepDataError:
-            raise
-        except Exception as error:  # damaged bags make the library raise nearly anything
-            reason = str(error).strip().rstrip(".") or type(error).__name__
-            raise CorruptDataError(f"{self.path} cannot be read as a ROS bag ({reason}); get it again.") from error
+        readers, is_ros1 = open_readers(self.path, ros1, ros2, self._stack, self._note)
+        store = types.get_typestore(types.Stores.ROS1_NOETIC if is_ros1 else types.Stores.ROS2_HUMBLE)
+        if TF_TYPE not in store.fielddefs:  # no part of ROS 1's common messages
+            store.register(types.get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", TF_TYPE))
+        self._deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+        return readers
 
     # -- topics
+
+    def _list_topics(self) -> dict[str, _Topic]:
+        found: dict[str, _Topic] = {}
+        for k, reader in enumerate(self._readers):
+            for connection in reader.connections:
+                if not connection.msgcount:
+                    continue
+                so_far = found.get(connection.topic, _Topic(connection.msgtype, 0, {}))
+                kind = so_far.msgtype
+                if kind != connection.msgtype:
+                    kind = f"{kind} and {connection.msgtype}"
+                so_far.connections.setdefault(k, []).append(connection)
+                messages = so_far.messages + connection.msgcount
+                found[connection.topic] = _Topic(kind, messages, so_far.connections)
+        return found
 
     def _list(self) -> str:
         names = sorted(self._there)
@@ -197,111 +231,165 @@ class Bag:
 
     # -- messages
 
-    def _messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield time [ns] and raw message of a topic, in the order of time."""
-        with self._explained():
-            for connection, time, raw in self._reader.messages(self._there[topic].connections):
-                yield time, (raw, connection.msgtype)
+    def _messages(self, topic: str) -> Iterator[tuple[int, bytes]]:
+        """Yield time of recording [ns] and raw message of a topic, in the order of that time."""
+        of_reader = self._there[topic].connections
+        with explained(self.path):
+            parts = [self._readers[k].messages(connections=of_reader[k]) for k in of_reader]
+            for _, time, raw in parts[0] if len(parts) == 1 else heapq.merge(*parts, key=lambda message: message[1]):
+                yield time, raw
 
-    def _decode(self, message: Any) -> Any:
-        with self._explained():
-            return self._reader.deserialize(*message)
+    def _decode(self, raw: bytes, kind: str) -> Any:
+        with explained(self.path):
+            return self._deserialize(raw, kind)
 
-    def tracks(self, mount: Sequence[float], assume_same_frame: bool) -> Tracks:
+    def tracks(self, reading: Reading) -> Tracks:
         """Return where the robot was, where it should go, and when scans came.
-
-        Parameters
-        ----------
-        mount : sequence of float
-            x, y [m] and yaw [rad] of the scanner, robot frame.
-        assume_same_frame : bool
-            Whether goals and odometry are in one frame although their names differ.
 
         Raises
         ------
+        ConfigError
+            If the scans do not say how far the scanner sees, and nobody else does.
         DatasetError
-            If frames differ, or nothing usable is there.
+            If goals are in a frame that nothing joins with the odometry's, or nothing usable is there.
         CorruptDataError
             If the bag is damaged.
         """
-        first: Any = None
-        scan_times = []
-        for time, message in self._messages(self.topics.scan):
-            first = message if first is None else first
-            scan_times.append(time)
-        frame, times, states = self._odometry()
-        goal_times, goals = self._goals(frame, assume_same_frame)
+        book = ScannerBook(f"{self.path}: {self.topics.scan}", reading.mount, reading.reach, reading.invalid_is_free)
+        scans: list[tuple[int, int]] = []
+        for time, raw in self._messages(self.topics.scan):
+            scan = self._decode(raw, SCAN_TYPE)
+            book.add(scan)
+            scans.append((time, _stamp(scan.header)))
+        lidar, fits = book.finish(self._note)
+        numbers = np.flatnonzero(fits)
+        recorded, stamped = np.array(scans, np.int64)[numbers].T
+        frame, odometry_times, states = self._odometry()
+        clock = choose_clock((recorded, stamped), (odometry_times[:, 0], odometry_times[:, 1]))
+        if not clock.stamps:
+            self._note(
+                f"{self.path}: headers' stamps are not used ({clock.why_not}); rows follow the time of recording"
+            )
+        scan_times, numbers = _in_order(clock.times(recorded, stamped), numbers)
+        times, states = _in_order(clock.times(odometry_times[:, 0], odometry_times[:, 1]), states)
+        goal_times, goals = self._goals(frame, clock, reading.assume_same_frame)
         return Tracks(
-            np.array(scan_times, np.int64), self._lidar(self._decode(first), mount), times, states[:, :3],
-            states[:, 3:], goal_times, goals,
+            scan_times, numbers, lidar, book, clock, times, states[:, :3], states[:, 3:], goal_times, goals
         )  # fmt: skip
 
     def _odometry(self) -> tuple[str, Ints, Floats]:
+        """Return the frame, times (N, 2) of recording and stamping [ns], and states (N, 6), as recorded."""
         frame = ""
         rows: list[tuple[float, ...]] = []
-        times: list[int] = []
-        for time, message in self._messages(self.topics.odometry):
-            odometry = self._decode(message)
+        times: list[tuple[int, int]] = []
+        count = turned = 0
+        for time, raw in self._messages(self.topics.odometry):
+            odometry = self._decode(raw, ODOMETRY_TYPE)
             frame = frame or str(odometry.header.frame_id)
-            p, q = odometry.pose.pose.position, odometry.pose.pose.orientation
+            p, yaw = odometry.pose.pose.position, yaw_of(odometry.pose.pose.orientation)
             v, w = odometry.twist.twist.linear, odometry.twist.twist.angular
-            yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-            row = (p.x, p.y, yaw, v.x, v.y, w.z)
+            row = (p.x, p.y, math.nan if yaw is None else yaw, v.x, v.y, w.z)
+            count, turned = count + 1, turned + (yaw is None)
             if all(map(math.isfinite, row)):
                 rows.append(row)
-                times.append(time)
+                times.append((time, _stamp(odometry.header)))
+        lacks = f", {turned} of them without an orientation (a quaternion of zeros)" if turned else ""
         if not rows:
-            raise DatasetError(f"{self.path}: no message on {self.topics.odometry} has finite numbers; use another.")
+            raise DatasetError(
+                f"{self.path}: no message on {self.topics.odometry} has finite numbers{lacks}; use another."
+            )
+        if len(rows) < count:
+            self._note(
+                f"{self.path}: left out {count - len(rows)} of {count} messages on {self.topics.odometry} with numbers "
+                f"that are not finite{lacks}"
+            )
         return frame, np.array(times, np.int64), np.array(rows, np.float64)
 
-    def _goals(self, frame: str, assume_same_frame: bool) -> tuple[Ints, Floats]:
+    def _goals(self, frame: str, clock: Clock, assume_same_frame: bool) -> tuple[Ints, Floats]:
         times: list[int] = []
         goals: list[tuple[float, float]] = []
-        for time, message in self._messages(self.topics.goal) if self.topics.goal else ():
-            goal = self._decode(message)
-            seen, point = str(goal.header.frame_id), (float(goal.pose.position.x), float(goal.pose.position.y))
+        last: tuple[str, float, float] | None = None
+        frames: Frames | None = None
+        moved: set[str] = set()
+        for recorded, raw in self._messages(self.topics.goal) if self.topics.goal else ():
+            goal = self._decode(raw, GOAL_TYPE)
+            seen, place = str(goal.header.frame_id), goal.pose.position
+            point = (float(place.x), float(place.y))
+            again = last is not None and last[0] == seen and math.dist(last[1:], point) < SAME_GOAL
+            if not all(map(math.isfinite, point)) or again:
+                continue
+            last = (seen, *point)
+            time = clock.time(recorded, _stamp(goal.header))
             if seen and frame and seen.strip("/") != frame.strip("/") and not assume_same_frame:
-                raise DatasetError(
-                    f"{self.path}: goals on {self.topics.goal} are in frame {seen!r}, odometry on "
-                    f"{self.topics.odometry} in {frame!r}; choose an odometry in the goals' frame, or --goal-topic "
-                    "none, or --assume-same-frame if they coincide."
-                )
-            if all(map(math.isfinite, point)) and not (goals and math.dist(goals[-1], point) < SAME_GOAL):
-                times.append(time)
-                goals.append(point)
-        return np.array(times, np.int64), np.array(goals, np.float64).reshape(-1, 2)
+                frames = self._frames(clock) if frames is None else frames
+                matrix = frames.transform(seen, frame, time)
+                if matrix is None:
+                    raise DatasetError(self._apart(seen, frame, frames))
+                x, y = (matrix @ [*point, float(place.z), 1.0])[:2]
+                point = (float(x), float(y))
+                moved.add(seen)
+            times.append(time)
+            goals.append(point)
+        if moved:
+            self._note(
+                f"{self.path}: goals are in frame {', '.join(sorted(moved))}, odometry in {frame}: taken over by /tf "
+                "as of when each goal came"
+            )
+        order, places = _in_order(np.array(times, np.int64), np.array(goals, np.float64).reshape(-1, 2))
+        return order, places
 
-    def _lidar(self, scan: Any, mount: Sequence[float]) -> Lidar:
-        if not 1 <= len(scan.ranges) <= MAX_RAYS:
-            raise DatasetError(f"{self.path}: a scan has {len(scan.ranges):,} ranges; expected 1 to {MAX_RAYS:,}.")
-        x, y, yaw = mount
-        return Lidar(
-            len(scan.ranges), float(scan.angle_min), float(scan.angle_increment), float(scan.range_min),
-            float(scan.range_max), x, y, yaw,
-        )  # fmt: skip
+    def _apart(self, seen: str, frame: str, frames: Frames) -> str:
+        has = f"those in the bag do not join them ({len(frames)} frames)" if len(frames) else "the bag has none"
+        return (
+            f"{self.path}: goals on {self.topics.goal} are in frame {seen!r}, odometry on {self.topics.odometry} in "
+            f"{frame!r}; choose an odometry in the goals' frame, or record /tf and /tf_static ({has}), or --goal-topic "
+            "none, or --assume-same-frame if they coincide."
+        )
 
-    def ranges(self, wanted: Ints, lidar: Lidar) -> Iterator[npt.NDArray[np.float32]]:
-        """Yield the ranges [m] of the scans at the positions `wanted`, which never go down.
+    def _frames(self, clock: Clock) -> Frames:
+        """Return the frames of the bag's transforms."""
+        frames = Frames()
+        for topic, static in TF_TOPICS.items():
+            if topic not in self._there or self._there[topic].msgtype not in TF_TYPES:
+                continue
+            for recorded, raw in self._messages(topic):
+                for transform in self._decode(raw, TF_TYPE).transforms:
+                    frames.add(transform, clock.time(recorded, _stamp(transform.header)), static)
+        return frames
+
+    def scans(self, wanted: Ints, book: ScannerBook) -> Iterator[tuple[Lidar, npt.NDArray[np.float32]]]:
+        """Yield scanner and ranges [m] of the scans of these numbers, in the order given.
 
         Raises
         ------
-        DatasetError
-            If a scan's rays are not those of `lidar`.
+        CorruptDataError
+            If there is no such scan: the bag was changed while it was read.
         """
+        left = Counter(wanted.tolist())
         messages = enumerate(self._messages(self.topics.scan))
-        at, ranges = -1, np.empty(0, np.float32)
+        kept: dict[int, tuple[Lidar, npt.NDArray[np.float32]]] = {}
         for k in wanted.tolist():
-            if k != at:
-                found = next((item for item in messages if item[0] == k), None)
-                if found is None:
+            while k not in kept:
+                number, (_, raw) = next(messages, (-1, (0, b"")))
+                if number < 0:
                     raise CorruptDataError(f"{self.path} ends before scan {k}: it was changed while it was read.")
-                at, (_, message) = found
-                scan = self._decode(message)
-                seen = self._lidar(scan, (lidar.x, lidar.y, lidar.yaw))
-                if seen != lidar:
-                    raise DatasetError(
-                        f"{self.path}: scan {k} on {self.topics.scan} has other rays than the first ({seen}, {lidar}); "
-                        "expected one scanner with one setting per bag."
-                    )
-                ranges = np.asarray(scan.ranges, np.float32)
-            yield ranges
+                if left[number]:  # stamps may say another order than that of recording
+                    scan = self._decode(raw, SCAN_TYPE)
+                    lidar = book.lidar(scan)
+                    if lidar is None:
+                        raise CorruptDataError(f"{self.path}: scan {number} was changed while it was read.")
+                    kept[number] = lidar, np.asarray(scan.ranges, np.float32)
+            yield kept[k]
+            left[k] -= 1
+            if not left[k]:
+                del kept[k]
+
+
+def _stamp(header: Any) -> int:
+    """Return the stamp of a header [ns]."""
+    return int(header.stamp.sec) * SECOND + int(header.stamp.nanosec)
+
+
+def _in_order(times: Ints, values: npt.NDArray[Any]) -> tuple[Ints, npt.NDArray[Any]]:
+    order = np.argsort(times, kind="stable")
+    return times[order], values[order]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import platform
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,11 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from navrep_data._version import __version__
-from navrep_data.datasets._bag import NO_TOPIC, Bag, Topics, Tracks
+from navrep_data.datasets._bag import NO_TOPIC, Bag, Reading, Topics, Tracks
+from navrep_data.datasets._bag_scans import Adapters
 from navrep_data.datasets.npz import MAX_ROWS_PER_SHARD, MAX_SEQUENCES_PER_SHARD, align
 from navrep_data.errors import ConfigError, DatasetError
 from navrep_data.io import new_folder, sha256_bytes, sha256_file
-from navrep_data.observations import ScanAdapter, scan_to_rings
+from navrep_data.observations import scan_to_rings
+from navrep_data.observations.blind import describe_rays, runs_of
 from navrep_data.schema import COLUMNS, DT, RANGE_MAX, SensorContract
 from navrep_data.shards import Manifest, ShardEntry, ShardWriter, dataset_card, publish
 
@@ -39,7 +42,7 @@ _NANOSECONDS = 1_000_000_000
 
 @dataclass(frozen=True)
 class _Piece:
-    """The rows of one sequence, without scans."""
+    """The rows of one sequence, without scans; `scans` are their numbers in the bag."""
 
     arrays: Arrays
     pose: npt.NDArray[np.float64]
@@ -74,19 +77,21 @@ def import_rosbag(
     env: str = "rosbag",
     dt: float = DT,
     length: int = 1000,
-    range_max: float = RANGE_MAX,
+    range_max: float | None = None,
     mount: Sequence[float] = (0.0, 0.0, 0.0),
     goal_radius: float = GOAL_RADIUS,
     assume_same_frame: bool = False,
+    invalid_is_free: bool = False,
     rings: bool = True,
     progress: Callable[[int, int], None] | None = None,
+    note: Callable[[str], None] | None = None,
 ) -> Manifest:
     """Turn ROS bags with a laser scan, odometry and perhaps goals into a dataset.
 
     Parameters
     ----------
     source : path-like or iterable of path-like
-        ROS 1 ``.bag`` files, folders of ROS 2 bags.
+        ROS 1 ``.bag`` files, folders of ROS 2 bags (without their metadata.yaml, if need be), ``.mcap``, ``.db3``.
     out : path-like
         New dataset folder.
     scan_topic, odometry_topic : str, optional
@@ -101,23 +106,29 @@ def import_rosbag(
         Time between rows [s].
     length : int
         Most rows of a sequence.
-    range_max : float
-        Of the new scans [m]; what is further away counts as free.
+    range_max : float, optional
+        Of the new scans [m], 25 by default; what is further away counts as free. Where the recorded scans' own
+        range_max is 0 or NaN it has to be given, and says from which range on the scanner hit nothing.
     mount : sequence of float
         x, y [m] and yaw [rad] of the scanner on the robot, robot frame.
     goal_radius : float
         A goal is reached nearer than this [m].
     assume_same_frame : bool
-        Take goals and odometry as given in one frame although their frame ids differ.
+        Take goals and odometry as given in one frame although their frame ids differ, and leave ``/tf`` alone.
+    invalid_is_free : bool
+        Whether NaN, 0 and ranges below range_min mean that nothing was hit, as with drivers that report no return so.
+        Otherwise they say nothing (:mod:`navrep_data.observations.blind`).
     rings : bool
         Store rings too (else they are computed when read).
     progress : callable, optional
         Called with (sequences done, sequences in all).
+    note : callable, optional
+        Called with each line about what was left out or read in another way than usual; by default they go to stderr.
 
     Returns
     -------
     Manifest
-        Of the new dataset.
+        Of the new dataset; ``config["blind_rays"]`` are those that are 0 in every scan of a bag.
 
     Raises
     ------
@@ -126,11 +137,12 @@ def import_rosbag(
     DatasetNotFoundError
         If there is no such bag.
     ConfigError
-        If a setting cannot be used, or a topic has to be chosen.
+        If a setting cannot be used, or a topic or range_max has to be given.
     DatasetError
-        If a bag lacks scans or odometry, they are too rare for `dt`, frames differ, or nothing is left.
+        If a bag lacks scans or odometry, they are too rare for `dt`, no transform joins the frames of goals and
+        odometry, or nothing is left.
     CorruptDataError
-        If a bag is damaged.
+        If a bag is damaged; the message names the command that mends it.
     FolderInUseError
         If `out` holds something.
 
@@ -138,19 +150,24 @@ def import_rosbag(
     -----
     Source: navrep/tools/data_extraction.py: the action that led to a row is the odometry's twist, reward is -0.01 per
     row and 100 on arrival, an unknown goal is NaN. As in :func:`import_npz`, ``action`` and ``reward`` of a row are
-    those that led to the next. Differences: rows are `dt` apart by the clock that recorded the bag, each with the
-    nearest scan and odometry; the scan is seen from the robot's centre with the usual 1080 rays
-    (:class:`ScanAdapter`), 0 where the scanner says nothing; poses are kept.
+    those that led to the next. Differences: rows are `dt` apart by the stamps in headers (by the time of recording
+    where scans or odometry have none, or stamps of two clocks), each with the nearest scan and odometry; the scan is
+    seen from the robot's centre with the usual 1080 rays (:class:`ScanAdapter`), each by its own description, 0 where
+    nobody saw anything; poses are kept. Goals in another frame are taken to the odometry's by ``/tf`` and
+    ``/tf_static`` as of when they came.
 
     An episode ends where its goal is reached (``goal``), or another goal comes, the sequence is full, or scans or
     odometry pause (``cut``; after a pause a new sequence begins). A goal that was reached is not known any more.
     """
     paths = [Path(source)] if isinstance(source, str | os.PathLike) else [Path(item) for item in source]
+    reach, range_max = range_max, RANGE_MAX if range_max is None else range_max
     _check(paths, dt, length, range_max, mount, goal_radius)
+    reading = Reading(mount, reach, invalid_is_free, assume_same_frame)
+    say = _print if note is None else note
     recordings = []
     for path in paths:
-        with Bag(path, scan_topic, odometry_topic, goal_topic) as bag:
-            tracks = bag.tracks(mount, assume_same_frame)
+        with Bag(path, scan_topic, odometry_topic, goal_topic, say) as bag:
+            tracks = bag.tracks(reading)
             topics = bag.topics
         _check_rates(path, topics, tracks, dt)
         recordings.append(_Recording(path, topics, tracks, list(_pieces(tracks, dt, length, goal_radius))))
@@ -161,8 +178,29 @@ def import_rosbag(
         )
     with new_folder(out, what="an import") as part:
         sensor = SensorContract(range_max=float(range_max), dt=float(dt))
-        manifest = _plan(recordings, env, sensor, length, rings, goal_radius)
+        blind = _blind_rays(recordings, sensor, say)
+        manifest = _plan(recordings, env, sensor, length, rings, goal_radius, blind)
         return _write(part, manifest, recordings, rings, progress)
+
+
+def _print(line: str) -> None:
+    print(line, file=sys.stderr)
+
+
+def _blind_rays(
+    recordings: Sequence[_Recording], sensor: SensorContract, say: Callable[[str], None]
+) -> list[list[int]]:
+    """Return the rays that are blind in every scan of a bag, as pairs [first, last], and say so once."""
+    blind = np.zeros(sensor.n_rays, np.bool_)
+    for r in recordings:
+        blind |= r.tracks.book.never_seen(sensor)
+    if blind.any():
+        where = describe_rays(blind, sensor.angle_min, sensor.angle_increment)
+        say(
+            f"{int(blind.sum())} of {sensor.n_rays} rays are blind in every scan ({where}): they are 0, unknown in "
+            "rings, and declared in the manifest (blind_rays)"
+        )
+    return [[a, b] for a, b in runs_of(blind)]
 
 
 def _check(
@@ -210,7 +248,7 @@ def _pieces(tracks: Tracks, dt: float, length: int, radius: float) -> Iterator[_
             for low in range(a, b, length):
                 rows = slice(low, min(low + length, b))
                 if rows.stop - rows.start > 1:
-                    yield _piece(tracks, goals, grid[rows], scans[rows], odometry[rows])
+                    yield _piece(tracks, goals, grid[rows], tracks.scan_numbers[scans[rows]], odometry[rows])
 
 
 class _Goals:
@@ -262,13 +300,23 @@ def _hash(path: Path) -> str:
 
 
 def _plan(
-    recordings: Sequence[_Recording], env: str, sensor: SensorContract, length: int, rings: bool, radius: float
-) -> Manifest:
+    recordings: Sequence[_Recording], env: str, sensor: SensorContract, length: int, rings: bool, radius: float,
+    blind: list[list[int]],
+) -> Manifest:  # fmt: skip
     """Return the manifest of the dataset before any shard is written."""
     config = {
-        "source": [{"file": r.path.name, "sha256": _hash(r.path), **asdict(r.topics)} for r in recordings],
+        "source": [
+            {
+                "file": r.path.name,
+                "sha256": _hash(r.path),
+                **asdict(r.topics),
+                "clock": "stamps" if r.tracks.clock.stamps else "recording",
+            }
+            for r in recordings
+        ],
         # a scanner without a limit has an infinite range_max, which JSON does not have
         "lidars": [{k: v if math.isfinite(v) else None for k, v in asdict(r.tracks.lidar).items()} for r in recordings],
+        "blind_rays": blind,
         "goal_radius": radius,
     }
     return Manifest(
@@ -293,12 +341,14 @@ def _plan(
 def _sequences(recordings: Sequence[_Recording], sensor: SensorContract, rings: bool) -> Iterator[Arrays]:
     """Yield the columns of all sequences, in order."""
     number = 0
+    adapt = Adapters(sensor)
     for r in recordings:
-        adapter = ScanAdapter(r.tracks.lidar, sensor, unknown=0.0)
-        with Bag(r.path, r.topics.scan, r.topics.odometry, r.topics.goal or NO_TOPIC) as bag:
-            ranges = bag.ranges(np.concatenate([p.scans for p in r.pieces]), r.tracks.lidar) if r.pieces else iter(())
+        if not r.pieces:
+            continue
+        with Bag(r.path, r.topics.scan, r.topics.odometry, r.topics.goal or NO_TOPIC, lambda _: None) as bag:
+            seen = bag.scans(np.concatenate([p.scans for p in r.pieces]), r.tracks.book)
             for piece in r.pieces:
-                scan = adapter(np.stack([next(ranges) for _ in piece.scans]))
+                scan = np.stack([adapt(*next(seen)) for _ in piece.scans])
                 yield piece.columns(number, scan, rings)
                 number += 1
 
