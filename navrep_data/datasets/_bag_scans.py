@@ -125,8 +125,8 @@ class ScannerBook:
             seen = "none" if other is None else f"{other.n_rays} every {other.angle_increment:.6g} rad"
             raise DatasetError(
                 f"{self.where}: {odd} of {len(fits)} scans are unlike the others: scan {k} has other rays than the "
-                f"first usable one ({seen}; {usual.n_rays} every {usual.angle_increment:.6g} rad); expected one scanner "
-                "per topic. Choose another with --scan-topic."
+                f"first usable one ({seen}; {usual.n_rays} every {usual.angle_increment:.6g} rad); expected one scanner"
+                " on a topic. Choose another with --scan-topic."
             )
         if odd:
             note(f"{self.where}: left out {odd} of {len(fits)} scans, which are empty, short or of other rays")
