@@ -170,5 +170,5 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     known : iterable of str
         The names that exist.
     """
-    close = difflib.get_close_matches(name.lower(), [str(k) for k in known], n=1, cutoff=0.5)
+    close = difflib.get_close_matches(str(name).lower(), [str(k) for k in known], n=1, cutoff=0.5)
     return f" Did you mean '{close[0]}'?" if close else ""

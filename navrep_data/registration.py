@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Collection
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
 from typing import Any
@@ -29,21 +30,37 @@ ENVIRONMENTS = (
 """Names of the environments, as in :func:`navrep_data.sim.environment_names`; listed here because that loads numba."""
 
 
-_SQUASHED = {name.replace("-", ""): name for name in ENVIRONMENTS}
+def plain(name: str) -> str:
+    """Return a name of an environment or suite without what its spellings differ in.
+
+    ``navrep-test``, ``navreptest``, ``NavRepTest-v0`` and ``navrep_data:NavRepTest-v0`` are one name: the package
+    before it, the version behind it, capitals, hyphens and underscores do not count.
+    """
+    bare = name.removeprefix("navrep_data:").lower()
+    bare = bare.removesuffix(f"-v{VERSION}")
+    return bare.replace("-", "").replace("_", "")
+
+
+def spelled(name: object, known: Collection[str]) -> str | None:
+    """Return which of the `known` names is meant in whatever spelling, None where none is.
+
+    Parameters
+    ----------
+    name : str
+        As somebody typed it, see :func:`plain`.
+    known : collection of str
+        Names in the spelling that is stored.
+    """
+    if not isinstance(name, str):
+        return None
+    return next((one for one in known if one == name), None) or next(
+        (one for one in known if plain(one) == plain(name)), None
+    )
 
 
 def camel_case(name: str) -> str:
     """Return a kebab-case name in CamelCase, as gymnasium spells ids: ``mark-train-1`` -> ``MarkTrain1``."""
     return "".join(_SPELLED.get(word, word.capitalize()) for word in name.split("-"))
-
-
-def environment_of(name: str) -> str:
-    """Return an environment's name however it is spelt: ``NavRepTest-v0``, ``navreptest`` -> ``navrep-test``.
-
-    A name that is none is returned as it is.
-    """
-    bare = name.rpartition(":")[2].removesuffix(f"-v{VERSION}")
-    return _SQUASHED.get(bare.replace("-", "").replace("_", "").lower(), name)
 
 
 def register() -> None:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from navrep_data.errors import ConfigError
-from navrep_data.registration import environment_of
 from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, Event
 from navrep_data.sim import SimConfig, Simulator, make_config, numpy_seed, scale_actions
 from navrep_data.sim import _layout as lay
@@ -37,7 +36,7 @@ def make_env_config(env: str | SimConfig, **changes: Any) -> SimConfig:
     """Return the config of an environment's name, or a config itself, with some fields changed (None = unchanged)."""
     if isinstance(env, SimConfig):
         return env.replace(**{name: value for name, value in changes.items() if value is not None})
-    return make_config(environment_of(env), **changes)
+    return make_config(env, **changes)
 
 
 def observation_space(config: SimConfig) -> Any:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shlex
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +15,9 @@ from navrep_data.evaluate.baselines import DwaPilot, GoalPilot, OrcaPilot, Rando
 from navrep_data.evaluate.pilots import FunctionPilot, Pilot, ZooPilot, source_hash
 from navrep_data.generate.policy import load_callable
 from navrep_data.io import sha256_file
-from navrep_data.zoo.folders import is_path, policy_files
+from navrep_data.zoo.fetching import HUB_SCHEME
+from navrep_data.zoo.folders import is_path, place_of, policy_files
+from navrep_data.zoo.names import here_hint
 
 BASELINES: dict[str, type[Pilot]] = {pilot.name: pilot for pilot in (GoalPilot, RandomPilot, OrcaPilot, DwaPilot)}
 """Policies without weights, by name."""
@@ -166,16 +170,14 @@ def _hashes(function: Callable[..., Any]) -> dict[str, str]:
 
 def _from_folder(name: str, how: dict[str, str]) -> PilotSpec:
     from navrep_data.zoo import load
-    from navrep_data.zoo.fetching import HUB_SCHEME
     from navrep_data.zoo.policy import Policy
 
-    if name.startswith(HUB_SCHEME):
-        from navrep_data.zoo.hub import fetch_model
-
-        folder = fetch_model(name)
-    else:
-        folder = Path(name).expanduser().resolve()
+    place = place_of(name)
+    assert place is not None
+    folder = place.resolve()
+    if not name.startswith(HUB_SCHEME):
         name = os.path.normpath(name)
+    _refuse_sb3(folder)
     if how["ranges"] == "as_released":
         raise _not_released(name)
     loaded = load(folder)  # told before the first episode is played
@@ -188,14 +190,33 @@ def _from_folder(name: str, how: dict[str, str]) -> PilotSpec:
     return PilotSpec(name, "scan", name, "folder", str(folder), files=files).fed(**how)
 
 
+def _refuse_sb3(path: Path) -> None:
+    """Say what to write for a stable-baselines3 file: it holds pickled objects, which nothing here opens."""
+    try:
+        with zipfile.ZipFile(path) as found:
+            if "_stable_baselines3_version" not in found.namelist():
+                return
+    except (OSError, zipfile.BadZipFile):
+        return
+    code = (
+        f"from stable_baselines3 import PPO; model = PPO.load({str(path)!r}); act = lambda scan, robot_state: "
+        'model.predict({"scan": scan.clip(0, 25), "robot_state": robot_state}, deterministic=True)[0]'
+    )
+    raise PolicyError(
+        f"{path.name} is a file of stable-baselines3: it holds pickled objects, which run code when loaded, so "
+        f"navrep-data does not open it. If it is yours, write one line of Python and name that: echo "
+        f"{shlex.quote(code)} > sb3_policy.py && navrep-data benchmark sb3_policy:act"
+    )
+
+
 def _from_zoo(name: str, source: str | None, how: dict[str, str]) -> PilotSpec:
     from navrep_data.zoo import registry
 
     if name.partition(".")[0] not in registry.variants():
         known = [*BASELINES, *registry.full_names(), *registry.variants()]
         raise UnknownNameError(
-            f"Unknown policy {name!r}.{did_you_mean(name, known)} Baselines: {', '.join(BASELINES)}; networks: "
-            "navrep-data models; your own: ./folder or module:function."
+            f"Unknown policy {name!r}.{did_you_mean(name, known)}{here_hint(name)} Baselines: {', '.join(BASELINES)}; "
+            "networks: navrep-data models; your own: ./folder or module:function."
         )
     record = registry.resolve(name)
     if record.kind != "policy":

@@ -15,7 +15,7 @@ from navrep_data.evaluate.world_model import WorldModelError
 from navrep_data.evaluate.world_model_results import FOLDER
 from navrep_data.evaluate.world_model_results import load as load_world_model
 from navrep_data.zoo import registry
-from navrep_data.zoo.local import is_folder
+from navrep_data.zoo.folders import is_path, place_of
 from navrep_data.zoo.names import OWN
 from navrep_data.zoo.registry import Record
 
@@ -31,16 +31,17 @@ SOURCES = {
 
 def full_name(name: str) -> str:
     """Return the full name of a model of the zoo; a folder as it is."""
-    return name if is_folder(name) else registry.find(name).name
+    return name if is_path(name) else registry.find(name).name
 
 
 def weights_of(name: str) -> dict[str, str]:
     """Return the hashes of a model's files, its parts' included, by file."""
-    if not is_folder(name):
+    place = place_of(name)
+    if place is None:
         return _hashes(registry.find(name))
     from navrep_data.models import checkpoint
 
-    return {"model.safetensors": str(checkpoint.read_config(name).get("weights_sha256"))}
+    return {"model.safetensors": str(checkpoint.read_config(place).get("weights_sha256"))}
 
 
 def _hashes(record: Record) -> dict[str, str]:

@@ -12,6 +12,7 @@ from navrep_data.errors import ConfigError, UnknownNameError, did_you_mean
 from navrep_data.evaluate.map_worlds import ScenarioWorlds
 from navrep_data.evaluate.worlds import PolygonWorlds, Worlds
 from navrep_data.io import json_bytes
+from navrep_data.registration import spelled
 from navrep_data.sim import SimConfig, make_config
 from navrep_data.sim.maps import load_map
 from navrep_data.sim.scenarios import MAP_GROUPS, get_scenario, scenario_names
@@ -196,16 +197,14 @@ def suite_names() -> list[str]:
 
 
 def get_suite(name: str) -> Suite:
-    """Return a suite by name.
+    """Return a suite by name, in whatever spelling: ``navreptest``, ``navrep-test``, ``NavRepTest-v0``.
 
     Raises
     ------
     UnknownNameError
         If there is no such suite.
     """
-    try:
-        return _SUITES[name]
-    except KeyError:
-        raise UnknownNameError(
-            f"Unknown suite {name!r}.{did_you_mean(name, _SUITES)} Known: {', '.join(_SUITES)}."
-        ) from None
+    found = spelled(name, _SUITES)
+    if found is None:
+        raise UnknownNameError(f"Unknown suite {name!r}.{did_you_mean(name, _SUITES)} Known: {', '.join(_SUITES)}.")
+    return _SUITES[found]

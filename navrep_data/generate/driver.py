@@ -169,6 +169,7 @@ def generate(
         env, physics=physics, humans=humans, obstacles=obstacles, rendering=None if legs else "trunk",
         curriculum="constant", maps=None if maps is None else tuple(maps),
     )  # fmt: skip
+    env = config.env  # in the spelling that is stored
     check_seed(seed)
     part = _check_place(executor, address, storage, shard_range)
     if workers is not None:

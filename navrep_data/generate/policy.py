@@ -68,6 +68,12 @@ def make_policy(policy: str | PolicyFunction, batch: int) -> PolicySpec:
     if callable(policy):
         kind = policy if hasattr(policy, "__qualname__") else type(policy)
         return PolicySpec(f"{kind.__module__}:{kind.__qualname__}", batch, policy)
+    if "/" in policy or policy.startswith("~"):
+        raise PolicyError(
+            f"policy is {policy!r}, expected one of: {', '.join(SCRIPTED)}, or module:function. A network drives as "
+            f"one: a file drive.py with the line `from navrep_data import zoo; policy = zoo.load({policy!r})` is named "
+            "drive:policy."
+        )
     if ":" in policy:
         return PolicySpec(policy, batch)
     return PolicySpec(ScriptedPolicy(policy).name)

@@ -6,7 +6,14 @@ from navrep_data.sim.gridmap import GridMap
 from navrep_data.sim.map_rollout import CallableMapRollout, ScriptedMapRollout
 from navrep_data.sim.maps import load_map, map_names
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
-from navrep_data.sim.registry import describe_environment, environment_names, gymnasium_id, make_config, numpy_seed
+from navrep_data.sim.registry import (
+    describe_environment,
+    environment_name,
+    environment_names,
+    gymnasium_id,
+    make_config,
+    numpy_seed,
+)
 from navrep_data.sim.rollout import (
     CallableRollout,
     PolicyFunction,
@@ -36,6 +43,7 @@ __all__ = [
     "WorldState",
     "check_seed",
     "describe_environment",
+    "environment_name",
     "environment_names",
     "get_scenario",
     "gymnasium_id",

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from navrep_data.errors import ConfigError, UnknownNameError, did_you_mean
-from navrep_data.registration import VERSION, camel_case
+from navrep_data.registration import VERSION, camel_case, spelled
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.map_environments import MAP_ENVIRONMENTS, original_fields
 
@@ -51,7 +51,7 @@ def environment_names() -> list[str]:
 
 def describe_environment(name: str) -> str:
     """Return one line on what an environment is."""
-    return _lookup(name)[0]
+    return _ENVIRONMENTS[environment_name(name)][0]
 
 
 def numpy_seed(env: str, episode: int) -> int:
@@ -71,7 +71,7 @@ def numpy_seed(env: str, episode: int) -> int:
     ConfigError
         If the environment has no numbered episodes, or `episode` is no whole number from 0.
     """
-    _lookup(env)
+    env = environment_name(env)
     if env not in _NUMBERED:
         raise ConfigError(f"Environment {env!r} has no numbered episodes; those that do: {', '.join(_NUMBERED)}.")
     if isinstance(episode, bool) or not isinstance(episode, (int, np.integer)) or episode < 0:
@@ -88,17 +88,28 @@ def gymnasium_id(name: str) -> str:
     UnknownNameError
         If there is no such environment.
     """
-    _lookup(name)
-    return f"{camel_case(name)}-v{VERSION}"
+    return f"{camel_case(environment_name(name))}-v{VERSION}"
 
 
-def _lookup(name: str) -> tuple[str, dict[str, Any]]:
-    try:
-        return _ENVIRONMENTS[name]
-    except KeyError:
+def environment_name(name: str) -> str:
+    """Return an environment's name as it is stored, in whatever spelling it is given.
+
+    Parameters
+    ----------
+    name : str
+        ``navrep-test``, ``navreptest``, ``NavRepTest-v0`` or ``navrep_data:NavRepTest-v0``.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such environment.
+    """
+    found = spelled(name, _ENVIRONMENTS)
+    if found is None:
         raise UnknownNameError(
             f"Unknown environment {name!r}.{did_you_mean(name, _ENVIRONMENTS)} Known: {', '.join(environment_names())}."
-        ) from None
+        )
+    return found
 
 
 def make_config(env: str = "soadrl", **changes: Any) -> SimConfig:
@@ -118,7 +129,8 @@ def make_config(env: str = "soadrl", **changes: Any) -> SimConfig:
     ConfigError
         If a field is unknown or has a wrong value.
     """
-    fields = _lookup(env)[1]
+    env = environment_name(env)
+    fields = _ENVIRONMENTS[env][1]
     if changes.get("physics") == "original":
         fields = fields | original_fields(env)
     wanted = {name: value for name, value in changes.items() if value is not None}

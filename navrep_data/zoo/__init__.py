@@ -99,12 +99,9 @@ def load(
     ModelNotFoundError, CheckpointError
         If there is no model in the folder or repository, or it is not one of this package.
     """
-    if isinstance(name, str) and name.startswith(_fetching.HUB_SCHEME):
-        from navrep_data.zoo.hub import fetch_model
-
-        name = fetch_model(name)
-    if _folders.is_path(name):
-        return _folders.load_folder(name, inference=inference, seed=seed, **options)
+    place = _folders.place_of(name)
+    if place is not None:
+        return _folders.load_folder(place, inference=inference, seed=seed, **options)
     name = os.fspath(name)
     record = _registry.resolve(name)
     where = _fetching.Source.of(source)

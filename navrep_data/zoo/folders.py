@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from navrep_data.errors import CheckpointError, ConfigError, ModelNotFoundError
 from navrep_data.io import atomic_write_json, read_json
 from navrep_data.schema import RobotContract, SensorContract
+from navrep_data.zoo.fetching import HUB_SCHEME
 
 if TYPE_CHECKING:
     from torch import nn
@@ -33,10 +34,33 @@ _KINDS = {"vae": "vae", "memory": "memory", "controller": "controller", "e2e": "
 
 
 def is_path(name: str | os.PathLike[str]) -> bool:
-    """Return whether a model is named by its place: ``./folder``, ``/folder``, ``FILE.safetensors``, a path object."""
+    """Return whether a model is named by its place: ``./folder``, ``hf://user/name``, ``FILE.safetensors``, a path."""
     if not isinstance(name, str):
         return True
     return "/" in name or os.sep in name or name in (".", "..") or name.startswith("~") or name.endswith(".safetensors")
+
+
+def place_of(name: str | os.PathLike[str]) -> Path | None:
+    """Return where on this machine the model lies that is named by its place; None for a name of the zoo.
+
+    Parameters
+    ----------
+    name : str or path-like
+        What somebody typed: ``./folder``, ``/folder``, ``~/folder``, ``FILE.safetensors``, a path object, or
+        ``hf://user/name``, which is fetched. A bare word is a name of the zoo, whatever lies in the working folder.
+
+    Raises
+    ------
+    HubError, OfflineError, DownloadError, CorruptDataError
+        If a model on the Hub cannot be had.
+    """
+    if not is_path(name):
+        return None
+    if isinstance(name, str) and name.startswith(HUB_SCHEME):
+        from navrep_data.zoo.hub import fetch_model
+
+        return fetch_model(name)
+    return Path(name).expanduser()
 
 
 def save_policy(policy: Policy, folder: Path | str, metadata: Mapping[str, Any] | None = None) -> Path:

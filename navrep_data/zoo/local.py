@@ -9,7 +9,7 @@ from typing import Any
 from navrep_data.errors import CheckpointError
 from navrep_data.io import read_json
 from navrep_data.schema import SensorContract
-from navrep_data.zoo.folders import check_described, trained_robot
+from navrep_data.zoo.folders import check_described, is_training, load_folder, place_of, trained_robot
 
 POLICY_FILE = "policy.json"
 """Beside a controller's weights: what it sees through."""
@@ -18,20 +18,15 @@ PARTS = "world_model"
 _MAX_JSON = 1 << 16
 
 
-def is_folder(name: str | os.PathLike[str]) -> bool:
-    """Return whether NAME|DIR means a path: it has a separator, is absolute, or exists as a file or folder."""
-    text = os.fspath(name)
-    return os.sep in text or text.endswith((".safetensors", ".json")) or Path(text).is_dir()
-
-
 def load_any_model(name: str | os.PathLike[str], source: str | os.PathLike[str] | None = None, **options: Any) -> Any:
-    """Load a model of the zoo by name, or a checkpoint by its folder.
+    """Load a model of the zoo by name, or a checkpoint by its place.
 
     Parameters
     ----------
     name : str or path-like
-        Name such as ``transformer_1d.released``, or a folder with ``model.safetensors`` and ``config.json``: a
-        checkpoint of :mod:`navrep_data.models.checkpoint`, what ``navrep-data train`` wrote, or a policy of
+        Name such as ``transformer_1d.released``, or a place (``./folder``, ``hf://user/name``, see
+        :func:`navrep_data.zoo.folders.place_of`) with ``model.safetensors`` and ``config.json``: a checkpoint of
+        :mod:`navrep_data.models.checkpoint`, what ``navrep-data train`` wrote, or a policy of
         :func:`navrep_data.zoo.save_policy`.
     source : path-like or str, optional
         Where names are looked for, see :func:`navrep_data.zoo.load`.
@@ -49,17 +44,15 @@ def load_any_model(name: str | os.PathLike[str], source: str | os.PathLike[str] 
     UnknownNameError, CorruptDataError, OfflineError, DownloadError
         As :func:`navrep_data.zoo.load`.
     """
-    if not is_folder(name):
+    path = place_of(name)
+    if path is None:
         from navrep_data import zoo
 
         return zoo.load(os.fspath(name), source, **options)
-    path = Path(name)
     if not path.exists():
         raise CheckpointError(
             f"There is no {path}; expected a folder with model.safetensors, or a name: navrep-data models"
         )
-    from navrep_data.zoo.folders import is_training, load_folder
-
     if is_training(path):
         return load_policy(path, **options)
     if (path / POLICY_FILE).is_file():

@@ -9,6 +9,8 @@ reachable, and changing a line of it is a change of format (CHANGELOG).
 
 from __future__ import annotations
 
+from pathlib import Path
+
 RELEASED = "released"
 OWN = "v1"
 
@@ -32,6 +34,14 @@ WILDCARDS = "*?["
 
 SHIPPED_BYTES = 45_000_000
 """The weights in the package take at most this much."""
+
+
+def here_hint(name: str) -> str:
+    """Return a sentence on a file or folder that an unknown name may mean, empty where there is none.
+
+    A bare word is always a name of the zoo, so that no folder that happens to lie here changes what a command does.
+    """
+    return f" There is a ./{name} here: to name that, write ./{name}." if name and Path(name).exists() else ""
 
 
 def split_name(name: str) -> tuple[str, str | None]:

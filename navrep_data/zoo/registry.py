@@ -19,7 +19,7 @@ from typing import Any
 
 from navrep_data.errors import UnknownNameError, did_you_mean
 from navrep_data.io import FileId
-from navrep_data.zoo.names import OWN, RELEASED, WILDCARDS, alias_line, default_tag, split_name
+from navrep_data.zoo.names import OWN, RELEASED, WILDCARDS, alias_line, default_tag, here_hint, split_name
 
 KINDS = ("policy", "controller", "world_model", "vae", "memory")
 FOLDER = Path(__file__).parent
@@ -235,7 +235,7 @@ def find(name: str) -> Record:
     variant, tag = split_name(name)
     runs = variants().get(variant)
     if runs is None:
-        raise UnknownNameError(f"Unknown model {name!r}.{_closest(name)} List all: navrep-data models")
+        raise UnknownNameError(f"Unknown model {name!r}.{_closest(name)}{here_hint(name)} List all: navrep-data models")
     tag = default_tag(variant) if tag is None else tag
     fitting = [r for r in runs if r.tag == tag or (tag == RELEASED and r.released)]
     # a day alone names its run where it is the only one of that day
@@ -251,7 +251,7 @@ def find(name: str) -> Record:
             f"{meant}: this version of navrep-data does not contain it. "
             f"The NavRep authors' weights: {variant}.{RELEASED}{_shipped_hint()}"
         )
-    raise UnknownNameError(f"Unknown model {name!r}: {variant} has no tag {tag!r}. Its runs: {every}")
+    raise UnknownNameError(f"Unknown model {name!r}: {variant} has no tag {tag!r}.{here_hint(name)} Its runs: {every}")
 
 
 def _shipped_hint() -> str:
