@@ -75,6 +75,7 @@ def test_large_maps_become_coarser_without_losing_walls():
 
 def test_metrics_have_their_units(results):
     units = {metric.name: metric.unit.replace("^3", "\u00b3") for metric in METRICS if metric.unit}
+    units["contact_speed"] = "m/s"
     assert Reader(results_page(results / "0.json").html).meta["units"] == units
 
 
