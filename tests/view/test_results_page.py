@@ -150,5 +150,5 @@ def test_what_is_no_results(tmp_path, results, dataset):
         results_page(tmp_path / "a.json")
     write_results(tmp_path / "mixed", "p", seed=0)
     write_results(tmp_path / "mixed", "q", seed=1, physics="consistent")
-    with pytest.raises(ConfigError, match="several suites or physics"):
+    with pytest.raises(ConfigError, match="several suites, physics or first rounds"):
         results_page(tmp_path / "mixed")
