@@ -1,11 +1,8 @@
-"""The package as a whole: lazy imports, errors, kernels' cache, the test helper."""
+"""The package as a whole: lazy imports, errors, the test helper."""
 
 import builtins
 import importlib
 import inspect
-import os
-import subprocess
-import sys
 
 import pytest
 
@@ -52,30 +49,3 @@ def test_tiny_dataset_is_real(tmp_path):
     assert set(manifest.splits) == {"train", "val", "test"}
     assert verify(root).ok
     assert tiny_dataset(tmp_path / "tiny") == root
-
-
-@pytest.mark.slow
-def test_an_edited_kernel_invalidates_its_callers(tmp_path):
-    """numba looks at the caller's file alone; our cache folder looks at all of them."""
-    package = tmp_path / "navrep_data"
-    source = os.path.dirname(navrep_data.__file__)
-    subprocess.run(["cp", "-r", source, str(package)], check=True)
-    (package / "sim" / "_probe_callee.py").write_text(
-        "from navrep_data._kernels import kernel\n\n\n@kernel\ndef number():\n    return 1\n"
-    )
-    (package / "sim" / "_probe_caller.py").write_text(
-        "from navrep_data._kernels import kernel\nfrom navrep_data.sim._probe_callee import number\n\n\n"
-        "@kernel\ndef twice():\n    return 2 * number()\n"
-    )
-    code = "from navrep_data.sim._probe_caller import twice; print(twice())"
-    env = {**os.environ, "PYTHONPATH": str(tmp_path), "NAVREP_DATA_HOME": str(tmp_path / "home")}
-
-    def run():
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-        return int(done.stdout)
-
-    assert run() == 2
-    callee = package / "sim" / "_probe_callee.py"
-    callee.write_text(callee.read_text().replace("return 1", "return 5"))
-    assert run() == 10

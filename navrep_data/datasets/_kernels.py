@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 
 Array = npt.NDArray[Any]
 

@@ -189,7 +189,7 @@ def _kernels() -> Iterator[Check]:
     import numba
     import numpy as np
 
-    from navrep_data._kernels import kernel_cache_folder
+    from navrep_data.kernels import kernel_cache_folder
     from navrep_data.observations import scan_to_rings
 
     config: Any = numba.config  # untyped: its switches are set dynamically

@@ -8,7 +8,7 @@ without time steps.
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._geometry import point_segment_sq
 
 # settings (SETTINGS,) float64

@@ -1,8 +1,8 @@
 # mypy: allow-untyped-defs, allow-untyped-decorators, no-check-untyped-defs
 """What the benchmark reads from batches of worlds on maps."""
 
-from navrep_data._kernels import kernel
 from navrep_data.evaluate._polygons import human_gap
+from navrep_data.kernels import kernel
 from navrep_data.sim._ian_contact import CLEARANCE_REACH, swept_cells
 from navrep_data.sim._ian_layout import M_MAP
 from navrep_data.sim._ian_orca import guided_velocity, pack_agents

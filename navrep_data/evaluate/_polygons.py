@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._geometry import swept_clearance
 from navrep_data.sim._layout import A_RADIUS, A_X, A_Y, S_HUMANS, S_OBST_ROBOT, S_POLYGONS
 from navrep_data.sim._step import orca_choice, pack_orca

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 
 N_SECTIONS = 64
 N_CELLS = 64

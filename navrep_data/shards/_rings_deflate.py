@@ -19,7 +19,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.shards._bits import high_zeros, low_zeros
 
 SECTION = 64

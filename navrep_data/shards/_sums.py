@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 
 
 @kernel

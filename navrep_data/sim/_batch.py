@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._layout import F_ROBOTS, S_EPISODE, S_HUMANS
 from navrep_data.sim._rng import seed_mt, seed_philox
 from navrep_data.sim._step import observe_humans, observe_scan, observe_state, reset_world, step_world

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._rng import integer
 
 # Ties between equally steep directions: the first one, or one drawn from a random stream.

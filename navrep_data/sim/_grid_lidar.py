@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._lidar import (
     BEARING_ERROR,
     CIRCLE_OWNER,

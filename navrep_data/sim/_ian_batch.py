@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._ian_layout import M_MAP, M_SEEDED, R_ROBOTS
 from navrep_data.sim._ian_orca import way_point
 from navrep_data.sim._ian_reset import reset_map_world

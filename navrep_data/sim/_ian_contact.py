@@ -10,7 +10,7 @@ Source: pepper_2d_simulator.py and pepper_2d_iarlenv.py of asl-pepper-2d-sim 0.0
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._geometry import point_segment_sq
 from navrep_data.sim._ian_layout import (
     T_CELLS,

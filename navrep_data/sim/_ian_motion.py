@@ -6,7 +6,7 @@ Source: odom_update of pepper_2d_simulator.py, asl-pepper-2d-sim 0.0.5 (SIM_FACT
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._ian_layout import (
     T_HEIGHT,
     T_RESOLUTION,

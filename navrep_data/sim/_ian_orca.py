@@ -6,7 +6,7 @@ ORCA alone looks no further than the next wall; the goal field knows the way rou
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._fast_marching import CORNERS_CLOSED, TIE_FIRST, descend
 from navrep_data.sim._ian_layout import (
     M_MAP,

@@ -6,7 +6,7 @@ Source: pepper_2d_iarlenv.py of asl-pepper-2d-sim 0.0.5 and CMap2D.pyx of pymap2
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._fast_marching import CORNERS_CLOSED, CORNERS_ORIGINAL, TIE_RANDOM, descend
 from navrep_data.sim._ian_layout import (
     T_PLAN_HEIGHT,

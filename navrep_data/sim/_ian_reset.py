@@ -6,7 +6,7 @@ Source: ianenv.py, markenv.py, jointenv.py of NavRep, pepper_2d_simulator.py (SI
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._fast_marching import UPWIND_ORIGINAL, march
 from navrep_data.sim._ian_layout import (
     C_CAST,

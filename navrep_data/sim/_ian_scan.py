@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._ellipse import body_ellipse, draw_ellipses
 from navrep_data.sim._grid_lidar import QUIRK_MANY, QUIRK_NONE, grid_inverse_ranges, scan_grid
 from navrep_data.sim._ian_contact import body_circles

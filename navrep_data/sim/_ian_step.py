@@ -6,7 +6,7 @@ Source: pepper_2d_simulator.py, pepper_2d_iarlenv.py, ianenv.py, markenv.py, joi
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._ian_contact import (
     CLEARANCE_REACH,
     CONTACT_PASSING,

@@ -7,7 +7,7 @@ human, and the progress towards the goal in metres (paper, "Learning-based Navig
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.schema import Event
 from navrep_data.sim._geometry import point_segment_sq, swept_clearance
 from navrep_data.sim._layout import (

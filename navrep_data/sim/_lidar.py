@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 
 # Columns of `circles`.
 CIRCLE_X, CIRCLE_Y, CIRCLE_RADIUS, CIRCLE_OWNER = 0, 1, 2, 3

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 
 # Directions along the lattice: right, up, left, down; turning left adds 1.
 _DX = (1, 0, -1, 0)

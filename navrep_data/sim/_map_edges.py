@@ -5,7 +5,7 @@ RVO2 sorts obstacles into a tree to find near ones, and cuts edges on the way. A
 seconds; here they stay whole and a chain stands for the tree, which only decides between edges at equal distance.
 """
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._obstacles import (
     OF_EX,
     OF_EY,

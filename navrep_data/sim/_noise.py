@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._layout import P_RANGE_MAX, P_SCAN_DROPOUT, P_SCAN_NOISE, S_NOISE_HIGH, S_NOISE_LOW, S_STEP
 from navrep_data.sim._rng import is_mersenne, philox, stream_key
 

@@ -11,8 +11,9 @@ One column per edge, one row per field, so that the scan over all edges runs on 
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from navrep_data.kernels import kernel
 
 # --- obst_f (OF_FIELDS, capacity) float32 -------------------------------------------------------------------
 OF_X = 0  # start of the edge [m]
@@ -61,13 +62,13 @@ def make_obstacles(capacity: int) -> tuple[NDArray[np.float32], NDArray[np.int32
     return np.zeros((OF_FIELDS, capacity), np.float32), np.zeros((OI_FIELDS, capacity), np.int32)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _left_of(ax, ay, bx, by, cx, cy):
     """Return twice the signed area of a, b, c: positive where c lies left of the line from a to b."""
     return (ax - cx) * (by - ay) - (ay - cy) * (bx - ax)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _add_polygons(vertices, polygon_start, obst_f, obst_i):
     """Enter the edges of all polygons; return their number, or -1 where they do not fit."""
     n = 0
@@ -107,7 +108,7 @@ def _add_polygons(vertices, polygon_start, obst_f, obst_i):
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _best_split(begin, m, obst_f, obst_i):
     """Return (position, left size, right size) of the edge whose line parts the list most evenly."""
     best = 0
@@ -146,7 +147,7 @@ def _best_split(begin, m, obst_f, obst_i):
     return best, best_left, best_right
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _split(i, j, new, obst_f, obst_i):
     """Cut edge `j` where the line of edge `i` crosses it; the far part becomes edge `new`."""
     ix = obst_f[OF_X, i]
@@ -176,7 +177,7 @@ def _split(i, j, new, obst_f, obst_i):
     obst_i[OI_PREV, far] = new
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _partition(i, best, m, begin, n_left, n_right, n, obst_f, obst_i):
     """Replace a list by its right part and, behind it, its left part; return the number of edges."""
     for b in range(m):
@@ -215,7 +216,7 @@ def _partition(i, best, m, begin, n_left, n_right, n, obst_f, obst_i):
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def tie_node(a, b, obst_i):
     """Return (node, side of a, side of b): the lowest node above both edges, and where they hang below it.
 
@@ -233,7 +234,7 @@ def tie_node(a, b, obst_i):
     return a, side_a, side_b
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _tie_code(a, b, obst_i):
     """Return the tie rule of edge `a` and the next edge `b`: fixed, or 2 * node + side of a below that node.
 
@@ -248,7 +249,7 @@ def _tie_code(a, b, obst_i):
     return 2 * node + side_a
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _finish(n, obst_f, obst_i):
     """Fill in what follows from the ends of the edges and from the tree."""
     short = False
@@ -266,7 +267,7 @@ def _finish(n, obst_f, obst_i):
         obst_i[OI_SHORT, 0] = 1 if short else 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def build_obstacles(vertices, polygon_start, obst_f, obst_i):
     """Build RVO2's obstacle edges and tree; return the number of edges, or -1 where they do not fit.
 

@@ -10,8 +10,8 @@ Where RVO2 branches per neighbour, the loops here compute both branches and sele
 """
 
 import numpy as np
-from numba import njit
 
+from navrep_data.kernels import kernel
 from navrep_data.sim._obstacles import (
     OF_DX,
     OF_DY,
@@ -79,7 +79,7 @@ OP_DT = 4
 ORCA_PARAM_FIELDS = 5
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _edge_ends(px, py, inv_tau, n, edges, obst_f, x1, y1, x2, y2, covered):
     """Write the (scaled) ends of `n` edges as seen from the agent, and that no line covers them yet."""
     for k in range(n):
@@ -91,7 +91,7 @@ def _edge_ends(px, py, inv_tau, n, edges, obst_f, x1, y1, x2, y2, covered):
         covered[k] = 0
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _cover(lx, ly, dx, dy, scaled_radius, n, x1, y1, x2, y2, covered):
     """Mark those of `n` edges both (scaled) ends of which a line keeps the agent off."""
     for k in range(whole_blocks(n)):
@@ -100,7 +100,7 @@ def _cover(lx, ly, dx, dy, scaled_radius, n, x1, y1, x2, y2, covered):
         covered[k] |= np.int32(1) if first & second else np.int32(0)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _tangent(x, y, dist_sq, radius, radius_sq, sign):
     """Direction of the tangent from the origin to a circle at (x, y); `sign` +1 = left, -1 = right."""
     leg = np.sqrt(dist_sq - radius_sq)
@@ -109,7 +109,7 @@ def _tangent(x, y, dist_sq, radius, radius_sq, sign):
     return (x * leg - y * r) * scale, (x * r + y * leg) * scale
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _put_line(x, y, dx, dy, n_lines, lines):
     lines[4 * n_lines] = x
     lines[4 * n_lines + 1] = y
@@ -118,7 +118,7 @@ def _put_line(x, y, dx, dy, n_lines, lines):
     return n_lines + 1
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _edge_line(j, px, py, vx, vy, radius, inv_tau, n, obst_f, obst_i, lines):
     """Add the constraint of edge `j`, which none covers, to the `n` lines, if it makes one; return their number."""
     o1 = j
@@ -259,7 +259,7 @@ def _edge_line(j, px, py, vx, vy, radius, inv_tau, n, obst_f, obst_i, lines):
     return _put_line(right_x + scaled_radius * rl_y, right_y - scaled_radius * rl_x, -rl_x, -rl_y, n, lines)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _agent_lines(px, py, vx, vy, radius, inv_tau, inv_dt, count, neighbors, lines):
     """Write the constraints of `count` neighbours to `lines`.
 
@@ -302,7 +302,7 @@ def _agent_lines(px, py, vx, vy, radius, inv_tau, inv_dt, count, neighbors, line
         lines[4 * k + 3] = -ux if circle else ly
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def orca_velocity(
     i, agents, lo, hi, extra, pref_vx, pref_vy, obst_f, obst_i, n_obst, params, work_f, work_i
 ):  # fmt: skip
@@ -371,7 +371,7 @@ def orca_velocity(
     return x, y
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def orca_step(agents, preferred, obst_f, obst_i, n_obst, params, work_f, work_i, out):
     """Write the new velocities of all agents, each of which sees all others, to `out` (N, 2) float32."""
     n = agents.shape[0]

@@ -5,8 +5,8 @@ A line is x, y, dx, dy in a flat array; velocities to its left are allowed. Line
 """
 
 import numpy as np
-from numba import njit
 
+from navrep_data.kernels import kernel
 from navrep_data.sim._obstacles import RVO_EPSILON
 
 LINE_FIELDS = 4
@@ -19,20 +19,20 @@ HALF = np.float32(0.5)
 NAN = np.float32(np.nan)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def whole_blocks(n):
     """Round up to whole vectors: the rest of a loop would run one by one, and is mostly all of it."""
     return (n + BLOCK - 1) // BLOCK * BLOCK
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def unit(x, y):
     length = np.sqrt(x * x + y * y)
     scale = F1 / (length if length > F0 else NAN)
     return x * scale, y * scale
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _program1(lines, line, radius, ox, oy, direction):
     """Optimise along one line under the lines before it and the speed limit: (found, x, y)."""
     px = lines[4 * line]
@@ -70,7 +70,7 @@ def _program1(lines, line, radius, ox, oy, direction):
     return True, px + t * dx, py + t * dy
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def program2(lines, n, radius, ox, oy, direction):
     """Find the allowed velocity nearest to (ox, oy) or farthest along it: (line that fails or n, x, y)."""
     if direction:
@@ -94,7 +94,7 @@ def program2(lines, n, radius, ox, oy, direction):
     return n, x, y
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _project(ix, iy, idx, idy, count, lines, projected):
     """Turn `count` lines into constraints on the velocities that violate the given line as much as them."""
     for j in range(whole_blocks(count)):
@@ -117,7 +117,7 @@ def _project(ix, iy, idx, idy, count, lines, projected):
         projected[4 * j + 3] = uy * scale
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def program3(lines, n_obstacle, n, begin, radius, x, y, projected):
     """Find the velocity that violates the agents' lines least where no velocity satisfies all."""
     for k in range(LINE_FIELDS * n_obstacle):

@@ -2,9 +2,9 @@
 """Who is near: obstacle edges and agents within range, nearest first, in RVO2's order."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from navrep_data.kernels import kernel
 from navrep_data.sim._obstacles import (
     LEFT,
     OF_EX,
@@ -72,7 +72,7 @@ def make_orca_work(max_edges: int = 512, max_agents: int = 64) -> tuple[NDArray[
     return work_f, np.zeros((WORK_I_ROWS, columns), np.int32)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _edge_distances(px, py, obst_f, n, work_f):
     """Squared distance to every edge that has the agent on its right, infinite for the others."""
     x = obst_f[OF_X]
@@ -100,7 +100,7 @@ def _edge_distances(px, py, obst_f, n, work_f):
         out[j] = d if left < F0 else INF
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _compact(n, limit, work_f, work_i):
     """Collect the indices with distance below `limit`; return their number."""
     m = 0
@@ -112,7 +112,7 @@ def _compact(n, limit, work_f, work_i):
     return m
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _sort(m, work_f, work_i):
     """Order the candidates by distance, equal ones by position: ranks by counting, which has no branches."""
     near = work_f[_NEAR]
@@ -129,17 +129,17 @@ def _sort(m, work_f, work_i):
         work_i[_ORDER, rank[a]] = a
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _left_of_edge(px, py, j, obst_f):
     return (obst_f[OF_X, j] - px) * obst_f[OF_EY, j] - (obst_f[OF_Y, j] - py) * obst_f[OF_EX, j]
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _near_side(px, py, j, obst_f):
     return LEFT if _left_of_edge(px, py, j, obst_f) >= F0 else RIGHT
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _comes_first(a, b, px, py, obst_f, obst_i):
     """Return whether RVO2's walk over the tree meets edge `a` before edge `b`."""
     if obst_i[OI_NEXT, a] == b or obst_i[OI_NEXT, b] == a:  # a shared corner: nearly every tie, prepared
@@ -159,7 +159,7 @@ def _comes_first(a, b, px, py, obst_f, obst_i):
     return side_a == near
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def _reached(j, px, py, range_sq, obst_f, obst_i):
     """Return whether RVO2's walk over the tree gets as far as edge `j`."""
     node = j
@@ -175,7 +175,7 @@ def _reached(j, px, py, range_sq, obst_f, obst_i):
     return True
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def obstacle_neighbors(px, py, range_sq, obst_f, obst_i, n, work_f, work_i):
     """List the edges within range, nearest first, ties in the order of RVO2's walk; return their number."""
     _edge_distances(px, py, obst_f, n, work_f)
@@ -206,7 +206,7 @@ def obstacle_neighbors(px, py, range_sq, obst_f, obst_i, n, work_f, work_i):
     return count
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@kernel(inline=True)
 def agent_neighbors(i, agents, lo, hi, extra, range_sq, most, work_f, work_i):
     """Copy the nearest agents to the neighbour rows, nearest first; return their number.
 

@@ -9,7 +9,7 @@ Source: crowd_sim.py and agent.py of soadrl-crowdnav 0.0.3, navreptrainenv.py of
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._geometry import point_segment_sq
 from navrep_data.sim._judge import COLLISION_HUMAN, COLLISION_OBSTACLE, GOAL, NONE, TIMEOUT, note_touch, reach_of_goal
 from navrep_data.sim._layout import (

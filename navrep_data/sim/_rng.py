@@ -14,7 +14,7 @@ without compilation.
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._layout import RNG_WORDS
 
 _MASK32 = np.uint64(0xFFFFFFFF)

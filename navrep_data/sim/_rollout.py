@@ -7,7 +7,7 @@ order, so a sequence has the same bytes however it was made.
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._judge import CUT, NONE, STUCK
 from navrep_data.sim._layout import (
     A_GAIT_T,

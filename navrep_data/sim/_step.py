@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._ellipse import body_ellipse, scan_ellipses
 from navrep_data.sim._judge import GOAL, NONE, judge, measure
 from navrep_data.sim._layout import (

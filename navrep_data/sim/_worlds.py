@@ -7,7 +7,7 @@ humans are only put where they are free, every loop is bounded, headings are uni
 
 import numpy as np
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._geometry import box_distance
 from navrep_data.sim._layout import (
     A_GX,

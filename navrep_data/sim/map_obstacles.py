@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from navrep_data._kernels import kernel
 from navrep_data.errors import ConfigError
+from navrep_data.kernels import kernel
 from navrep_data.sim._obstacles import (
     OF_DX,
     OF_DY,

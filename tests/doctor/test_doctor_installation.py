@@ -97,13 +97,13 @@ def test_pythons(monkeypatch):
 
 def test_kernels_cold_warm_and_without_a_place(monkeypatch, tmp_path):
     folder = tmp_path / "kernels"
-    monkeypatch.setattr("navrep_data._kernels.kernel_cache_folder", lambda: folder)
+    monkeypatch.setattr("navrep_data.kernels.kernel_cache_folder", lambda: folder)
     assert next(installation._kernels()).status == "note"
     (folder / "x").mkdir()
     (folder / "x" / "f.nbi").touch()
     warm = next(installation._kernels())
     assert (warm.status, warm.what) == ("ok", f"1 compiled in {folder}")
-    monkeypatch.setattr("navrep_data._kernels.kernel_cache_folder", lambda: Path("/proc/nowhere"))
+    monkeypatch.setattr("navrep_data.kernels.kernel_cache_folder", lambda: Path("/proc/nowhere"))
     place = next(installation._kernels())
     assert place.status == "problem"
     assert "set NAVREP_DATA_HOME" in place.what

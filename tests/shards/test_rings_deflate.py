@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.observations import scan_to_rings
 from navrep_data.shards._bits import high_zeros, low_zeros
 from navrep_data.shards._codec import encode, inflate
