@@ -17,8 +17,7 @@ from typing import Any
 
 import llvmlite
 import numba
-from numba import njit
-from numba.core.types import unliteral
+from numba import njit, types
 
 from navrep_data.io import cache_dir
 
@@ -107,6 +106,7 @@ def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False) 
     inner = _compiled(function, "from-kernels", {**options, "no_cpython_wrapper": True})
 
     def get_call_template(args: Iterable[Any], kws: Mapping[str, Any]) -> Any:
+        unliteral: Any = types.unliteral
         return inner.get_call_template([unliteral(a) for a in args], {k: unliteral(a) for k, a in kws.items()})
 
     # what numba asks a function for that a kernel calls
