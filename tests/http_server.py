@@ -2,7 +2,6 @@
 
 import contextlib
 import threading
-import time
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -13,7 +12,8 @@ class Site:
 
     files maps paths to content, moved maps paths to Location headers, answers maps paths to a list of statuses that
     come before the content does. cut_every ends each connection after that many body bytes; corrupt counts down the
-    answers whose last byte is flipped; hang is how long [s] the server falls silent in mid-body.
+    answers whose last byte is flipped; hangs counts down those in the middle of which the server falls silent, or drips
+    zeros, until the client leaves.
     """
 
     files: dict[str, bytes] = field(default_factory=dict)
@@ -21,7 +21,6 @@ class Site:
     answers: dict[str, list[int]] = field(default_factory=dict)
     cut_every: int | None = None
     corrupt: int = 0
-    hang: float = 0.0
     hangs: int = 0
     drip: bool = False
     ranges: bool = True
@@ -87,8 +86,7 @@ def _handler(site: Site) -> type[BaseHTTPRequestHandler]:
                 site.hangs -= 1
                 self.wfile.write(body[: len(body) // 2])
                 self.wfile.flush()
-                deadline = time.monotonic() + site.hang
-                while time.monotonic() < deadline and not site.stop.wait(0.02):
+                while not site.stop.wait(0.02):
                     if site.drip:
                         self.wfile.write(b"\0")
                 return

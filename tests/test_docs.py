@@ -1,10 +1,8 @@
 """The README and docs/: code blocks run as a reader would run them, commands parse, links lead somewhere."""
 
 import importlib.util
-import os
 import re
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +12,9 @@ import typer
 import navrep_data
 from navrep_data.cli.main import app
 from navrep_data.testing import tiny_dataset
+
+sys.path.insert(0, str(Path(__file__).parent))
+from warm_process import WarmProcess
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -71,35 +72,41 @@ def hub():
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=lambda page: page.stem)
 def test_code_blocks_run(page, tmp_path, hub):
-    env = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
-    env |= {
-        **hub,
-        "HF_HOME": str(tmp_path / "hf"),
-        "NAVREP_DATA_HOME": env.get("NAVREP_DATA_HOME", str(tmp_path / "home")),
-    }
+    env = {**hub, "HF_HOME": str(tmp_path / "hf")}
     if RELEASED.is_dir():
         env["NAVREP_RELEASED_DIR"] = str(RELEASED)
     if page.stem not in FROM_SCRATCH:
         tiny_dataset(tmp_path / "data" / "soadrl", n=12, length=200)
     ran = 0
-    for kind, code in blocks(page):
-        if ".released" in code and not RELEASED.is_dir():
-            continue  # the authors' files are not part of the repository
-        named = re.match(r"# (\w+\.py)\n", code)
-        if named:  # a file to save, for the commands that follow
-            (tmp_path / named.group(1)).write_text(code)
-            continue
-        if kind == "python":
-            commands = [[sys.executable, "-W", "error", "-c", code]]
-        else:
-            commands = [shlex.split(line) for line in lines(code) if not line.startswith(SETUP)]
-        for command in commands:
-            done = subprocess.run(
-                command, cwd=tmp_path, env=env, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=600
-            )
-            assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
-            ran += 1
+    with WarmProcess(env) as warm:
+        for kind, code in blocks(page):
+            if ".released" in code and not RELEASED.is_dir():
+                continue  # the authors' files are not part of the repository
+            named = re.match(r"# (\w+\.py)\n", code)
+            if named:  # a file to save, for the commands that follow
+                (tmp_path / named.group(1)).write_text(code)
+                continue
+            if kind == "python":
+                commands = [["-c", code]]
+            else:
+                commands = [shlex.split(line) for line in lines(code) if not line.startswith(SETUP)]
+                assert all(command[0] == "navrep-data" for command in commands), commands
+                commands = [command[1:] for command in commands]
+            for command in commands:
+                done = warm.run(command, tmp_path)
+                assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+                ran += 1
     assert ran >= 1
+
+
+def test_a_warm_process_says_what_failed(tmp_path):
+    with WarmProcess() as warm:
+        refused = warm.run(["info", "nowhere"], tmp_path)
+        assert (refused.returncode, refused.stdout, len(refused.stderr.splitlines())) == (2, "", 1)
+        wrong = warm.run(["-c", "import os, warnings; print(os.getcwd()); warnings.warn('no')"], tmp_path)
+        assert (wrong.returncode, wrong.stdout) == (1, f"{tmp_path}\n")
+        assert "UserWarning: no" in wrong.stderr
+        assert warm.run(["-c", "import os; os.kill(os.getpid(), 9)"], tmp_path).returncode == -9
 
 
 def commands_named():

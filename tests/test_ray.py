@@ -261,7 +261,6 @@ def test_a_cluster_of_its_own_ends_with_the_run(tmp_path):
     env = {k: v for k, v in os.environ.items() if k != "RAY_ADDRESS"}
     done = subprocess.run(
         [sys.executable, "-m", "navrep_data", *words.split()], cwd=tmp_path, env=env, capture_output=True, text=True,
-        timeout=200,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "3 sequences, 90 rows, 3 shards" in done.stdout
@@ -275,7 +274,7 @@ def test_from_the_command_line(nodes, tmp_path):
     nodes.fill()
     words = f"generate --n 3 --length 30 --humans 4 --obstacles 3 --executor ray --address {nodes.address} --out d"
     done = subprocess.run(
-        [sys.executable, "-m", "navrep_data", *words.split()], cwd=tmp_path, capture_output=True, text=True, timeout=200
+        [sys.executable, "-m", "navrep_data", *words.split()], cwd=tmp_path, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     generate(n=3, length=30, humans=4, obstacles=3, out=tmp_path / "here")
@@ -314,4 +313,4 @@ def test_flags_that_do_not_fit(tmp_path):
 
 def test_ray_is_imported_only_where_it_is_used():
     code = "import sys, navrep_data.cli.main, navrep_data.generate; sys.exit('ray' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", code], check=True)

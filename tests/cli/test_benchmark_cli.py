@@ -11,7 +11,7 @@ import pytest
 def run(*arguments, cwd=None):
     return subprocess.run(
         [sys.executable, "-m", "navrep_data", "benchmark", *map(str, arguments)],
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=cwd, timeout=300,
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=cwd,
         env={**os.environ, "COLUMNS": "200"},
     )  # fmt: skip
 
@@ -81,7 +81,7 @@ def test_without_the_maps_the_error_gives_the_command(tmp_path, monkeypatch):
         "from navrep_data.cli.main import run\n"
         "run(['benchmark', 'goal', '--suite', 'navrep27', '--episodes', '1'])\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=120)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 2
     assert "pip install" in done.stderr
     assert "navrep-data[maps]" in done.stderr

@@ -13,7 +13,7 @@ FLAGS = ["--humans", "3", "--obstacles", "2", "--length", "20", "--workers", "1"
 def run(*arguments, cwd=None):
     return subprocess.run(
         [sys.executable, "-m", "navrep_data", *map(str, arguments)],
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=cwd, timeout=300,
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=cwd,
         env={**os.environ, "COLUMNS": "200"},
     )  # fmt: skip
 

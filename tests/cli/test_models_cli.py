@@ -23,7 +23,7 @@ def run(tmp_path):
         environment |= {"COLUMNS": "200", "NAVREP_DATA_HOME": str(tmp_path / "home"), "NAVREP_DATA_OFFLINE": "1"}
         return subprocess.run(
             [sys.executable, "-m", "navrep_data", "models", *map(str, arguments)],
-            stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=cwd, timeout=500,
+            stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=cwd,
             env={**environment, **variables},
         )  # fmt: skip
 

@@ -31,7 +31,7 @@ def run(capsys, *arguments):
 def test_it_writes_a_page_and_prints_where(dataset, tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "navrep_data", "view", str(dataset)],
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=tmp_path, timeout=300, env={**os.environ},
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=tmp_path, env={**os.environ},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout == "crowd.view.html\n"

@@ -55,12 +55,11 @@ def run_slowly(out, workers, patience):
 def test_sigkill_loses_little_and_the_same_command_goes_on(tmp_path, workers):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     first = run_slowly(whole, 1, 0)
-    first.communicate(timeout=300)
+    first.communicate()
     assert first.returncode == 0
     file = "navreptest-original/pilots_for_tests-patient.json"
     process = run_slowly(cut, workers, 0.1)
-    due = time.monotonic() + 120
-    while not (cut / file).exists() and process.poll() is None and time.monotonic() < due:
+    while not (cut / file).exists() and process.poll() is None:
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
@@ -68,7 +67,7 @@ def test_sigkill_loses_little_and_the_same_command_goes_on(tmp_path, workers):
     outcome = json.loads((cut / file).read_text())["outcome"]
     assert 0 < len(outcome) - outcome.count("-") < 300
     again = run_slowly(cut, workers, 0)
-    assert "| 300 " in again.communicate(timeout=300)[0]
+    assert "| 300 " in again.communicate()[0]
     assert again.returncode == 0
     assert (cut / file).read_bytes() == (whole / file).read_bytes()
 

@@ -201,9 +201,11 @@ def test_sigkill_of_the_driver_loses_nothing(reference, tmp_path):
     )
     script = tmp_path / "run.py"
     script.write_text(code)
-    for delay in (1.0, 2.0, 2.5, 3.0):
+    for moment in ("*", "data/.*", "data/*.h5", "data/*1.h5"):  # the lock; a shard in the making; one, two finished
+        before = set(root.glob(moment))
         process = subprocess.Popen([sys.executable, str(script)])
-        time.sleep(delay)
+        while not set(root.glob(moment)) - before and process.poll() is None:
+            time.sleep(0.001)
         process.send_signal(signal.SIGKILL)
         process.wait()
         if (root / "manifest.json").exists():

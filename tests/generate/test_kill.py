@@ -67,6 +67,18 @@ def kill(pid):
     return True
 
 
+def wait_for(process, condition, *arguments):
+    """Wait until something is so or the process has ended, however long that takes; pytest's own limit ends a hang."""
+    while process.poll() is None and not condition(*arguments):
+        time.sleep(0.005)
+
+
+def wait_for_shards(process, root, more):
+    """Wait until there are so many more shards than now."""
+    before = len(list(root.glob("data/*.h5")))
+    wait_for(process, lambda: len(list(root.glob("data/*.h5"))) >= before + more)
+
+
 def cut_last_files(root, rng):
     """What a power cut may leave of the files written last: shorter ones, and temp files."""
     files = sorted((p for p in root.rglob("*.h5")), key=lambda p: p.stat().st_mtime_ns)
@@ -93,12 +105,15 @@ def test_killed_runs_end_with_the_bytes_of_an_unbroken_one(tmp_path):
     kills, finished, listed = {"driver": 0, "worker": 0}, 0, 0
     while sum(kills.values()) < KILLS:
         process = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True)
-        time.sleep(rng.uniform(0.8, 4.0))
+        more = rng.randrange(-1, 8)  # finished shards to wait for; -1: not even workers
+        if more >= 0:
+            wait_for(process, children, process.pid)
+        wait_for_shards(process, root, more)
         if process.poll() is None:
             workers = children(process.pid)
             if workers and rng.random() < 0.5:
                 kills["worker"] += kill(rng.choice(workers))
-                time.sleep(rng.uniform(0.0, 2.0))
+                wait_for_shards(process, root, rng.randrange(3))
             kills["driver"] += kill(process.pid)
         code = process.wait()
         error = process.stderr.read()
@@ -133,11 +148,9 @@ def test_a_dead_worker_is_replaced(tmp_path):
         f"if __name__ == '__main__':\n    generate(out={str(root)!r}, workers=2, **{SETTINGS!r})\n"
     )
     process = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 120
-    while not list(root.glob("data/*.h5")) and time.monotonic() < deadline:
-        time.sleep(0.02)
+    wait_for_shards(process, root, 1)
     killed = [kill(pid) for pid in children(process.pid)]
-    error = process.communicate(timeout=300)[1]
+    error = process.communicate()[1]
     assert process.returncode == 0, error
     assert any(killed)
     assert verify(root).ok
@@ -153,16 +166,11 @@ def test_workers_do_not_outlive_their_driver(tmp_path):
         f"    generate(n=4000, out={str(tmp_path / 'd')!r}, workers=2, seed=1, shard_size=1)\n"
     )
     process = subprocess.Popen([sys.executable, str(script)])
-    deadline = time.monotonic() + 60
-    workers = []
-    while len(workers) < 2 and time.monotonic() < deadline:
-        workers = children(process.pid)
-        time.sleep(0.05)
+    wait_for(process, lambda: len(children(process.pid)) == 2)
+    workers = children(process.pid)
     assert len(workers) == 2
-    time.sleep(1.0)
+    wait_for_shards(process, tmp_path / "d", 1)
     kill(process.pid)
     process.wait()
-    deadline = time.monotonic() + 20
-    while any(Path(f"/proc/{pid}").exists() for pid in workers) and time.monotonic() < deadline:
+    while any(Path(f"/proc/{pid}").exists() for pid in workers):  # pytest's own limit ends this where they stay
         time.sleep(0.05)
-    assert not [pid for pid in workers if Path(f"/proc/{pid}").exists()]

@@ -169,8 +169,7 @@ def test_streaming_fetches_ahead_in_the_order_of_the_epoch(hub, pushed):
     stream = StreamingSequenceDataset.from_hub(REPO, "1d", window=8, shuffle=False, buffer_sequences=2, prefetch=1)
     first = iter(stream)
     next(first)
-    deadline = time.monotonic() + 20
-    while hub.count(SHARD, "GET") < 2 and time.monotonic() < deadline:
+    while hub.count(SHARD, "GET") < 2:  # pytest's own limit ends a hang
         time.sleep(0.01)
     assert hub.count(SHARD, "GET") == 2  # the one that is read, and the next one
     first.close()

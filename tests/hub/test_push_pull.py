@@ -653,7 +653,7 @@ def command(hub, tmp_path):
         process = subprocess.Popen(line, env=environment, cwd=tmp_path, **pipes)
         if not wait:
             return process
-        out, err = process.communicate(timeout=120)
+        out, err = process.communicate()
         return process.returncode, out, err
 
     return start
@@ -714,7 +714,7 @@ def test_a_killed_push_goes_on(command, hub, template, tmp_path, how, after):
     process = command("push", template, REPO, "--license", "mit", wait=False)
     wait_for(lambda: len(hub.uploads) == after and hub.faults[0].times < 1000)
     process.send_signal(how)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate()
     assert set(hub.repo(REPO).files()) == {".gitattributes"}
     if how == signal.SIGINT:
         assert (process.returncode, err.count("Interrupted.")) == (130, 1)
@@ -735,7 +735,7 @@ def test_a_killed_pull_goes_on(command, hub, pushed, template, tmp_path, monkeyp
     wait_for(lambda: hub.faults[0].times < 1000)
     time.sleep(0.3)
     process.send_signal(how)
-    process.communicate(timeout=60)
+    process.communicate()
     with pytest.raises(DatasetNotFoundError):
         Manifest.read(root)
     hub.faults = []

@@ -4,7 +4,6 @@ import hashlib
 import random
 import subprocess
 import threading
-import time
 
 import pytest
 from http_server import Site, serving
@@ -158,25 +157,24 @@ def test_credentials_stay_with_their_host(site, tmp_path):
 
 
 def test_stalled_server_is_left_and_the_rest_fetched(site, tmp_path):
-    site.hang, site.hangs = 10.0, 1
-    assert get(site, tmp_path, timeout=0.3).read_bytes() == DATA
+    site.hangs = 1
+    assert get(site, tmp_path, timeout=2.0).read_bytes() == DATA
     assert site.seen[1][1] == f"bytes={len(DATA) // 2}-"
 
 
 def test_always_stalled_server_is_given_up(site, tmp_path):
-    site.hang, site.hangs = 10.0, 1000
+    site.hangs = 1000
     site.ranges = False
-    with pytest.raises(DownloadError, match=r"Gave up .* silent for 0.2 s"):
-        get(site, tmp_path, timeout=0.2, attempts=2)
+    with pytest.raises(DownloadError, match=r"Gave up .* silent for 1 s"):
+        get(site, tmp_path, timeout=1.0, attempts=2)
 
 
 def test_server_that_drips_is_as_good_as_stalled(site, tmp_path):
-    site.hang, site.hangs, site.drip = 10.0, 1, True
+    site.hangs, site.drip = 1, True
     expected = FileId(len(DATA), RIGHT.sha256)
     # dripped zeros are no part of the file: the first hash fails, the second download is whole
-    begun = time.monotonic()
-    assert get(site, tmp_path, expected, timeout=0.4).read_bytes() == DATA
-    assert time.monotonic() - begun < 8.0, "left long before the server had enough"
+    assert get(site, tmp_path, expected, timeout=2.0).read_bytes() == DATA
+    assert len(site.seen) == 2
 
 
 def test_404_says_what_was_expected_and_does_not_insist(site, tmp_path):

@@ -18,6 +18,8 @@ from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FIRST_FREE_FD = 10  # the browser reads at 3 and writes at 4; our ends must not be these
+# Only a hang takes so long [s]; a machine with other work may be ten times slower than an idle one.
+PATIENCE = 300.0
 
 
 def find_chromium() -> str | None:
@@ -77,7 +79,7 @@ class Chromium:
         os.close(self._in)
         os.close(self._out)
 
-    def call(self, method: str, session: str = "", timeout: float = 60.0, **params: Any) -> dict[str, Any]:
+    def call(self, method: str, session: str = "", timeout: float = PATIENCE, **params: Any) -> dict[str, Any]:
         """Send one command and return its result; events that come before are kept."""
         self._number += 1
         message: dict[str, Any] = {"id": self._number, "method": method, "params": params}
@@ -143,7 +145,7 @@ class Tab:
             raise RuntimeError(answer["exceptionDetails"]["exception"].get("description"))
         return answer["result"].get("value")
 
-    def wait(self, expression: str, timeout: float = 30.0) -> None:
+    def wait(self, expression: str, timeout: float = PATIENCE) -> None:
         end = time.monotonic() + timeout
         while not self.evaluate(expression):
             if time.monotonic() > end:
