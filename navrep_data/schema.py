@@ -93,9 +93,10 @@ class SensorContract:
         return abs(self.n_rays * self.angle_increment - 2.0 * math.pi) < 2.0 * self.angle_increment
 
 
-# SIM_FACTS a.3: the training environment draws the robot's radius from 0.3 to 0.5 m for every episode, and its full
-# action is 1 m/s along each axis
-TRAINING_SPEED, TRAINING_RADIUS = 1.0, 0.4
+# The training environment (agent.py, crowd_sim.py) draws the robot's radius from 0.3 to 0.5 m for every episode, and a
+# full action is 1 m/s along each axis. That the smallest radius stands for them was chosen (docs/experiments.md): what
+# is at the edge of a robot then looks at least as near as it ever did in training.
+TRAINING_SPEED, TRAINING_RADIUS = 1.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,8 @@ class RobotContract:
     max_speed : float
         Velocity along x and y that an action of 1 stands for [m/s].
     radius : float
-        Radius of the footprint [m]; where it is drawn for every episode (0.3 to 0.5 m in worlds of polygons), the mean.
+        Radius of the footprint [m]; where it is drawn for every episode (0.3 to 0.5 m in worlds of polygons), the
+        smallest.
     """
 
     max_speed: float = TRAINING_SPEED

@@ -11,7 +11,9 @@ from navrep_data.cli._common import print_json, say, say_err, show_progress
 from navrep_data.errors import ConfigError, NavrepDataError
 
 if TYPE_CHECKING:
-    from navrep_data.zoo import Report
+    from collections.abc import Sequence
+
+    from navrep_data.zoo import Record, Report
     from navrep_data.zoo.verification import Check
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -48,34 +50,50 @@ models_app = typer.Typer(
 def list_command(
     pattern: Annotated[str, typer.Argument(help="Name, variant or wildcards.")] = "*", as_json: Json = False
 ) -> None:
-    """List checkpoints: name, kind, what it reads, whether it is on this machine."""
+    """List checkpoints, those in the package first: kind, lidar, size, scores, whether it is on this machine.
+
+    A score is the share of episodes without a contact, and in brackets that which the suite counts as success.
+    """
     from navrep_data.zoo.fetching import Source, missing_here
     from navrep_data.zoo.names import default_tag
     from navrep_data.zoo.registry import find, list_models
 
     where = Source.of(None)
-    chosen = {find(name).name: find(name) for name in list_models(pattern)}
-    if not chosen:
+    found = {find(name).name: find(name) for name in list_models(pattern)}
+    if not found:
         raise ConfigError(f"No model matches {pattern!r}. List all: navrep-data models")
+    chosen = dict(sorted(found.items(), key=lambda item: not item[1].shipped))
     absent = {name: [entry.path for _, entry in missing_here(r, where)] for name, r in chosen.items()}
     if as_json:
         print_json([{**r.to_dict(), "here": not absent[name], "not_here": absent[name]} for name, r in chosen.items()])
         return
     width = max(map(len, chosen))
-    say(f"{'name':{width}}  {'kind':11}  {'z':>3}  {'h':>3}  inputs  here")
+    suites = ("navreptest", "navrep27")
+    say(f"{'name':{width}}  {'kind':11}  {'lidar':5}  {'size':>7}  {'  '.join(f'{s:>13}' for s in suites)}  here")
     for name, r in chosen.items():
         marks = "yes" if not absent[name] else f"no ({len(absent[name])} to fetch)"
         star = f"  = {r.variant}.released" if r.released and r.tag != "released" else ""
         if r.ours:
             star = f"  = {r.variant}, ours" if default_tag(r.variant) == r.tag else "  ours"
-        say(
-            f"{name:{width}}  {r.kind:11}  {_dash(r.z_size):>3}  {_dash(r.h_size):>3}  {_dash(r.n_inputs):>6}  "
-            f"{marks}{star}"
-        )
+        scores = "  ".join(f"{_score(r.results, suite):>13}" for suite in suites)
+        say(f"{name:{width}}  {r.kind:11}  {r.lidar or '-':5}  {_size(r):>7}  {scores}  {marks}{star}")
+    say_err("scores: episodes without a contact, and as released in brackets; '-' = not measured")
 
 
-def _dash(value: Any) -> str:
-    return "-" if value is None else str(value)
+def _size(record: Record) -> str:
+    """Return the size of a checkpoint's own files; those of its parts are listed with them."""
+    sizes = [entry.bytes for entry in record.files]
+    known = [size for size in sizes if size is not None]
+    return f"{sum(known) / 1e6:.2f} MB" if known and len(known) == len(sizes) else "-"
+
+
+def _score(results: Sequence[dict[str, Any]], suite: str) -> str:
+    """Return success in a suite's default physics, without contacts and as released."""
+    mine = [r for r in results if r.get("suite") == suite and r.get("physics") == "original"]
+    if not mine:
+        return "-"
+    free, released = (mine[0].get(key) for key in ("contact_free_rate", "success_rate"))
+    return ("-" if free is None else f"{100 * free:.1f}") + ("" if released is None else f" ({100 * released:.1f}) %")
 
 
 @models_app.command("show")

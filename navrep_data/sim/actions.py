@@ -18,7 +18,7 @@ def robot_contract(config: SimConfig) -> RobotContract:
     ----------
     config : SimConfig
         Its `max_velocity` along x counts. On maps the radius is always 0.3 m; elsewhere it is drawn from 0.3 to 0.5 m
-        for every episode, and its mean stands for it.
+        for every episode, and the smallest stands for them.
     """
     return RobotContract(config.max_velocity[0], RADIUS if config.world == "map" else TRAINING_RADIUS)
 

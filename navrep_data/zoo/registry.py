@@ -165,6 +165,11 @@ class Record:
         return bool(self.files)
 
     @property
+    def shipped(self) -> bool:
+        """Whether all its files, and those of its parts, are in this package."""
+        return all(e.packaged for e in self.files) and all(records()[part].shipped for part in self.parts.values())
+
+    @property
     def ours(self) -> bool:
         """Whether this project trained it, and not the authors."""
         return self.tag == OWN

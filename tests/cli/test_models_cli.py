@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -41,7 +42,15 @@ def test_list(run):
     assert done.stdout == "", "wildcards that match no full name"
     assert run("*rings_z.2*").stdout.count("\n") == 11
     assert len(json.loads(run("modular_1d_h", "--json").stdout)) == 3
-    assert json.loads(run("--json").stdout)[0]["here"] is False
+    found = json.loads(run("--json").stdout)
+    shipped = [r["name"].endswith(".v1") for r in found]
+    assert shipped == sorted(shipped, reverse=True)
+    assert found[0]["here"] is True
+    assert found[-1]["here"] is False
+    (ours,) = run("e2e_1d.v1").stdout.splitlines()[1:]
+    assert ours.split()[:5] == ["e2e_1d.v1", "policy", "1d", "0.55", "MB"]
+    assert re.search(r"\(68\.5\) % .* \(30\.5\) %  yes  = e2e_1d, ours$", ours)
+    assert " rings " in run("modular_rings.v1").stdout
 
 
 def test_list_tells_what_is_here(run, shared):

@@ -74,7 +74,7 @@ def test_another_robot_gets_the_policy_made_for_it():
     slow = {"max_velocity": (0.5, 0.5, 1.0)}
     policy = drive(Recording(), **slow)
     (other,) = policy.others
-    assert other.robot == RobotContract(0.5, 0.4)
+    assert other.robot == RobotContract(0.5, 0.3)
     np.testing.assert_allclose(other.told, [[0.5, -0.25, 0.0]] * 3)
     assert not policy.told
     as_trained = drive(Recording(), "none", **slow)
