@@ -22,8 +22,9 @@ from navrep_data.observations.rings import N_SECTIONS
 BLIND_RANGE = 1.0
 """Range [m] that models which read ranges are shown, at most, in a sector that nobody saw.
 
-Near enough that nobody drives there (a robot of 0.3 m at 1 m/s stops within it), and farther than what policies flee
-from: the training's penalty begins 0.2 m from the robot.
+With a goal 5 m behind and a blind sector of 60 to 120 degrees there, e2e_1d.v1 and joint_1d_z.v1 drive into it at 0.77
+to 0.98 m/s where it is called free, at 0.05 to 0.89 m/s where it reads 2 m, and away from it where it reads 1 m, as the
+networks on rings do where it is unknown.
 """
 
 

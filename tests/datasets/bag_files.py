@@ -117,3 +117,16 @@ def record(path, kind, seconds=8.0, goals=((0.35, 2.0, 1.0),), pause=None, scan_
             else:
                 bag.goal(t, *value)
     return bag.path
+
+
+def record_by_tf(path, kind):
+    """A robot with stamps in its headers, whose goal is in another frame: every part of a bag is read."""
+    with Recorder(path, kind, late=lambda *_: 0.0) as bag:
+        bag.transform(0.0, "map", "world", 1.0, 0.0, 0.5, topic="/tf_static")
+        for k in range(9):
+            bag.transform(0.1 * k, "world", "odom", 0.1 * k, 0.0, 0.0)
+            bag.scan(0.1 * k, 1 + 0.01 * np.arange(RAYS))
+            bag.odometry(0.1 * k, *drive(0.1 * k))
+            if k == 2:
+                bag.goal(0.2, 2.0, 1.0, frame="map")
+    return bag.path

@@ -287,9 +287,12 @@ def _read_npz(folder: Path) -> None:
 def _make_bag(kind: str) -> Callable[[Path], None]:
     def make(folder: Path) -> None:
         sys.path.insert(0, str(Path(__file__).parents[1] / "datasets"))
-        from bag_files import record
+        from bag_files import record, record_by_tf
 
-        record(folder / "bag", kind, seconds=0.8)
+        if kind == "mcap":
+            record(folder / "bag", kind, seconds=0.8)
+        else:
+            record_by_tf(folder / "bag", kind)
 
     return make
 
