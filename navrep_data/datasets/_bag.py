@@ -11,8 +11,7 @@ import heapq
 import importlib
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,9 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from navrep_data.datasets._bag_clock import SECOND, Clock, choose_clock
-from navrep_data.datasets._bag_frames import TF_TOPICS, TF_TYPES, Frames, yaw_of
+from navrep_data.datasets._bag_frames import TF_TOPICS, TF_TYPES, Frames, mounting, yaw_of
 from navrep_data.datasets._bag_repair import explained, open_readers
 from navrep_data.datasets._bag_scans import ScannerBook
+from navrep_data.datasets._bag_types import Reading, Topics, Tracks
 from navrep_data.errors import (
     ConfigError,
     CorruptDataError,
@@ -45,77 +45,6 @@ _LISTED = 12
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Note = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Topics:
-    """The topics of a bag that are used; `goal` is None where there is none."""
-
-    scan: str
-    odometry: str
-    goal: str | None
-
-
-@dataclass(frozen=True)
-class Reading:
-    """How a bag is to be read.
-
-    Attributes
-    ----------
-    mount : sequence of float
-        x, y [m] and yaw [rad] of the scanner, robot frame.
-    reach : float, optional
-        Range from which on nothing was hit [m], where the scans do not say.
-    invalid_is_free : bool
-        Whether NaN and 0 in scans mean that nothing was hit.
-    assume_same_frame : bool
-        Whether goals and odometry are in one frame although their names differ.
-    """
-
-    mount: Sequence[float]
-    reach: float | None
-    invalid_is_free: bool
-    assume_same_frame: bool
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """Everything in a bag but the ranges.
-
-    Attributes
-    ----------
-    scan_times : ndarray of shape (S,), int64
-        When each scan was made [ns], ascending.
-    scan_numbers : ndarray of shape (S,), int64
-        Which of the scans of the topic it is, in the order of recording.
-    lidar : Lidar
-        The scanner as most scans describe it, in its place on the robot.
-    book : ScannerBook
-        Describes each scan.
-    clock : Clock
-        What times are.
-    times : ndarray of shape (N,), int64
-        When the robot was there [ns], ascending.
-    pose : ndarray of shape (N, 3)
-        x, y [m], theta [rad] in the odometry's frame.
-    twist : ndarray of shape (N, 3)
-        vx, vy [m/s], omega [rad/s] along the robot's axes.
-    goal_times : ndarray of shape (G,), int64
-        When each new goal came [ns]; goals that were only published again are left out.
-    goals : ndarray of shape (G, 2)
-        x, y [m], in the odometry's frame.
-    """
-
-    scan_times: Ints
-    scan_numbers: Ints
-    lidar: Lidar
-    book: ScannerBook
-    clock: Clock
-    times: Ints
-    pose: Floats
-    twist: Floats
-    goal_times: Ints
-    goals: Floats
 
 
 class _Topic(NamedTuple):
@@ -257,14 +186,16 @@ class Bag:
         """
         book = ScannerBook(f"{self.path}: {self.topics.scan}", reading.mount, reading.reach, reading.invalid_is_free)
         scans: list[tuple[int, int]] = []
+        scanner = ""
         for time, raw in self._messages(self.topics.scan):
             scan = self._decode(raw, SCAN_TYPE)
+            scanner = scanner or str(scan.header.frame_id)
             book.add(scan)
             scans.append((time, _stamp(scan.header)))
         lidar, fits = book.finish(self._note)
         numbers = np.flatnonzero(fits)
         recorded, stamped = np.array(scans, np.int64)[numbers].T
-        frame, odometry_times, states = self._odometry()
+        frame, base, odometry_times, states = self._odometry()
         clock = choose_clock((recorded, stamped), (odometry_times[:, 0], odometry_times[:, 1]))
         if not clock.stamps:
             self._note(
@@ -272,20 +203,21 @@ class Bag:
             )
         scan_times, numbers = _in_order(clock.times(recorded, stamped), numbers)
         times, states = _in_order(clock.times(odometry_times[:, 0], odometry_times[:, 1]), states)
+        self._check_mount(scanner, base, clock, reading)
         goal_times, goals = self._goals(frame, clock, reading.assume_same_frame)
         return Tracks(
             scan_times, numbers, lidar, book, clock, times, states[:, :3], states[:, 3:], goal_times, goals
         )  # fmt: skip
 
-    def _odometry(self) -> tuple[str, Ints, Floats]:
-        """Return the frame, times (N, 2) of recording and stamping [ns], and states (N, 6), as recorded."""
-        frame = ""
+    def _odometry(self) -> tuple[str, str, Ints, Floats]:
+        """Return the frame, the robot's own, times (N, 2) of recording and stamping [ns], states (N, 6), as recorded."""
+        frame = base = ""
         rows: list[tuple[float, ...]] = []
         times: list[tuple[int, int]] = []
         count = turned = 0
         for time, raw in self._messages(self.topics.odometry):
             odometry = self._decode(raw, ODOMETRY_TYPE)
-            frame = frame or str(odometry.header.frame_id)
+            frame, base = frame or str(odometry.header.frame_id), base or str(odometry.child_frame_id)
             p, yaw = odometry.pose.pose.position, yaw_of(odometry.pose.pose.orientation)
             v, w = odometry.twist.twist.linear, odometry.twist.twist.angular
             row = (p.x, p.y, math.nan if yaw is None else yaw, v.x, v.y, w.z)
@@ -303,7 +235,7 @@ class Bag:
                 f"{self.path}: left out {count - len(rows)} of {count} messages on {self.topics.odometry} with numbers "
                 f"that are not finite{lacks}"
             )
-        return frame, np.array(times, np.int64), np.array(rows, np.float64)
+        return frame, base, np.array(times, np.int64), np.array(rows, np.float64)
 
     def _goals(self, frame: str, clock: Clock, assume_same_frame: bool) -> tuple[Ints, Floats]:
         times: list[int] = []
@@ -328,6 +260,8 @@ class Bag:
                 x, y = (matrix @ [*point, float(place.z), 1.0])[:2]
                 point = (float(x), float(y))
                 moved.add(seen)
+                if not all(map(math.isfinite, point)):
+                    continue
             times.append(time)
             goals.append(point)
         if moved:
@@ -346,10 +280,18 @@ class Bag:
             "none, or --assume-same-frame if they coincide."
         )
 
-    def _frames(self, clock: Clock) -> Frames:
+    def _check_mount(self, scanner: str, base: str, clock: Clock, reading: Reading) -> None:
+        """Say so if the bag knows the scanner to be in another place than it is taken to be."""
+        matrix = self._frames(clock, ["/tf_static"]).transform(scanner, base, 0) if scanner and base else None
+        seen = None if matrix is None else mounting(matrix, reading.mount)
+        if seen:
+            self._note(f"{self.path}: /tf_static has the scanner {scanner} on {base} at {seen} if that is right")
+
+    def _frames(self, clock: Clock, topics: Iterable[str] = TF_TOPICS) -> Frames:
         """Return the frames of the bag's transforms."""
         frames = Frames()
-        for topic, static in TF_TOPICS.items():
+        for topic in topics:
+            static = TF_TOPICS[topic]
             if topic not in self._there or self._there[topic].msgtype not in TF_TYPES:
                 continue
             for recorded, raw in self._messages(topic):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,8 @@ Ints = npt.NDArray[np.int64]
 TF_TOPICS = {"/tf": False, "/tf_static": True}
 """Topics of transforms, and whether these hold for all times."""
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+SAME_PLACE, SAME_YAW = 0.01, 0.01
+"""Mountings that differ by no more [m, rad] are the same."""
 LONGEST_CHAIN = 100
 """Frames between a frame and its root; more is a loop."""
 
@@ -37,6 +40,19 @@ def yaw_of(q: Any) -> float | None:
         return None
     x, y, z, w = unit
     return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+def mounting(matrix: Floats, mount: Sequence[float]) -> str:
+    """Return what the matrix (4, 4) from scanner to robot says against x, y [m] and yaw [rad]; empty if nothing."""
+    x, y, yaw = float(matrix[0, 3]), float(matrix[1, 3]), math.atan2(matrix[1, 0], matrix[0, 0])
+    turned = abs(math.remainder(yaw - mount[2], 2.0 * math.pi))
+    hangs = matrix[2, 2] < 0.0
+    if math.dist((x, y), mount[:2]) <= SAME_PLACE and turned <= SAME_YAW and not hangs:
+        return ""
+    place = f"{x:.3g},{y:.3g},{yaw:.3g}"
+    given = ",".join(f"{value:.3g}" for value in mount)
+    upside = " and upside down, which --mount cannot say," if hangs else ","
+    return f"{place}{upside} and it is taken to be at {given}: give --mount {place}"
 
 
 class _Edge(NamedTuple):

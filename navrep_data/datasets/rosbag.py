@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from navrep_data._version import __version__
-from navrep_data.datasets._bag import NO_TOPIC, Bag, Reading, Topics, Tracks
+from navrep_data.datasets._bag import NO_TOPIC, Bag
 from navrep_data.datasets._bag_scans import Adapters
+from navrep_data.datasets._bag_types import Reading, Topics, Tracks
 from navrep_data.datasets.npz import MAX_ROWS_PER_SHARD, MAX_SEQUENCES_PER_SHARD, align
 from navrep_data.errors import ConfigError, DatasetError
 from navrep_data.io import new_folder, sha256_bytes, sha256_file

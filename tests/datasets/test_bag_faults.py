@@ -235,6 +235,18 @@ def test_goals_in_a_frame_that_nothing_joins(tmp_path, transforms, has):
     assert read(bag, tmp_path / "d", assume_same_frame=True)[0].rows == 13
 
 
+@pytest.mark.parametrize("mount", [None, (0.25, 0.1, 1.5)])
+def test_mountings_that_the_bag_knows_better(tmp_path, mount):
+    with Recorder(tmp_path / "bag", "ros1") as bag:
+        bag.transform(0.0, "base_link", "plate", 0.25, 0.0, 0.0, topic="/tf_static")
+        bag.transform(0.0, "plate", "laser", 0.0, 0.1, 1.5, topic="/tf_static")
+        drive_along(bag)
+    _, said = read(bag, tmp_path / "d", **({"mount": mount} if mount else {}))
+    found = [line for line in said if "/tf_static has the scanner laser on base_link at 0.25,0.1,1.5, and" in line]
+    assert len(found) == (mount is None)
+    assert all("taken to be at 0,0,0: give --mount 0.25,0.1,1.5 if" in line for line in found)
+
+
 # --- topics that nobody reads
 
 
