@@ -40,6 +40,8 @@ NO_TOPIC = "none"
 USUAL_SCAN_TOPIC = "/combined_scan"
 # Goals nearer to each other than this are one goal, published again [m].
 SAME_GOAL = 1e-3
+# Times that leave room for differences in int64 [ns]: the year 2116.
+LATEST = 1 << 62
 _LISTED = 12
 
 Floats = npt.NDArray[np.float64]
@@ -166,6 +168,11 @@ class Bag:
         with explained(self.path):
             parts = [self._readers[k].messages(connections=of_reader[k]) for k in of_reader]
             for _, time, raw in parts[0] if len(parts) == 1 else heapq.merge(*parts, key=lambda message: message[1]):
+                if not -LATEST < time < LATEST:
+                    raise CorruptDataError(
+                        f"{self.path}: a message on {topic} was recorded at {time} ns, expected nanoseconds since 1970: "
+                        "the bag is damaged or its clock was."
+                    )
                 yield time, raw
 
     def _decode(self, raw: bytes, kind: str) -> Any:
@@ -210,7 +217,7 @@ class Bag:
         )  # fmt: skip
 
     def _odometry(self) -> tuple[str, str, Ints, Floats]:
-        """Return the frame, the robot's own, times (N, 2) of recording and stamping [ns], states (N, 6), as recorded."""
+        """Return the frame, the robot's own, times (N, 2) of recording and stamping [ns], and states (N, 6)."""
         frame = base = ""
         rows: list[tuple[float, ...]] = []
         times: list[tuple[int, int]] = []
