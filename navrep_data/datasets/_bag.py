@@ -170,8 +170,8 @@ class Bag:
             for _, time, raw in parts[0] if len(parts) == 1 else heapq.merge(*parts, key=lambda message: message[1]):
                 if not -LATEST < time < LATEST:
                     raise CorruptDataError(
-                        f"{self.path}: a message on {topic} was recorded at {time} ns, expected nanoseconds since 1970: "
-                        "the bag is damaged or its clock was."
+                        f"{self.path}: a message on {topic} was recorded at {time} ns, expected nanoseconds since "
+                        "1970: the bag is damaged or its clock was."
                     )
                 yield time, raw
 
