@@ -15,6 +15,7 @@ from typing import Any, Generic, TypeVar
 
 from navrep_data._version import __version__
 from navrep_data.errors import ClusterError, MissingExtraError, NavrepDataError, WorkerDiedError
+from navrep_data.io import translate_os_error
 
 PIP_COMMAND = "pip install 'navrep-data[ray]'"
 LOCAL = "local"
@@ -201,6 +202,8 @@ def _call(function: Callable[[Any, Any], Any], common: Any, task: Any, version: 
         return True, function(common, task), node
     except NavrepDataError as error:
         return False, error, node
+    except OSError as error:
+        return False, translate_os_error(error), node
 
 
 def _no_cluster(where: str, error: Exception) -> ClusterError:

@@ -112,6 +112,10 @@ class FolderNotWritableError(NavrepDataError, PermissionError):
     """The folder cannot be written."""
 
 
+class FileAccessError(NavrepDataError, OSError):
+    """The operating system refuses a file or folder: not readable, a name too long, a failing disk."""
+
+
 class PolicyError(NavrepDataError, ValueError):
     """A policy cannot be loaded, or returned something that is not a batch of actions."""
 

@@ -10,13 +10,15 @@ from typing import Any
 
 import typer
 
+from navrep_data.errors import FileAccessError
+
 INTERRUPTED = 130
 INTERRUPTED_LINE = "Interrupted. What was finished is intact; run the same command again to go on."
 
 
 def say(text: str) -> None:
     """Print a line for people to stdout."""
-    typer.echo(text)
+    _print(text)
 
 
 def say_err(text: str) -> None:
@@ -26,7 +28,26 @@ def say_err(text: str) -> None:
 
 def print_json(value: Any) -> None:
     """Print one JSON object to stdout."""
-    typer.echo(json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False))
+    # where the terminal cannot show every character JSON has its own way to write it
+    ascii_only = not str(getattr(sys.stdout, "encoding", None) or "utf-8").lower().startswith("utf")
+    _print(json.dumps(value, indent=1, ensure_ascii=ascii_only, allow_nan=False))
+
+
+def _print(text: str) -> None:
+    try:
+        typer.echo(text)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise refused_output(error) from error
+
+
+def refused_output(error: OSError) -> FileAccessError:
+    """Return what to say where standard output cannot be written."""
+    return FileAccessError(
+        f"Cannot write to the standard output: {error.strerror}. What was done is done; send the output elsewhere, or "
+        "free some space, and ask again."
+    )
 
 
 def show_progress() -> bool:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
+import signal
 import sys
+import threading
 import traceback
 from typing import Annotated, Any
 
 import typer
+import typer.main
 
 from navrep_data._version import __version__
 from navrep_data.cli import (
@@ -27,8 +33,9 @@ from navrep_data.cli import (
     verify,
     view,
 )
-from navrep_data.cli._common import INTERRUPTED, INTERRUPTED_LINE
-from navrep_data.errors import NavrepDataError, did_you_mean, one_line
+from navrep_data.cli._common import INTERRUPTED, INTERRUPTED_LINE, refused_output
+from navrep_data.errors import FileAccessError, NavrepDataError, did_you_mean, one_line
+from navrep_data.io import translate_os_error
 
 app = typer.Typer(
     name="navrep-data",
@@ -87,31 +94,76 @@ def _main(
 
 
 def run(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit: 0 all well, 1 a check failed, 2 an error of input or surroundings.
+    """Run the command line and exit: 0 all well, 1 a check failed, 2 an error of input or surroundings, 130 Ctrl-C.
 
     Errors are one line on stderr; ``--debug`` shows the traceback as well.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+    # a folder's name may have characters that the terminal has not
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
+    code = USAGE_ERROR
     try:
-        code = app(arguments, standalone_mode=False)
+        code = _run(arguments)
+        sys.stdout.flush()
     except (KeyboardInterrupt, typer.Abort):
+        _die_of_the_next_interrupt()
         typer.echo(INTERRUPTED_LINE, err=True)
         code = INTERRUPTED
     except BrokenPipeError:  # the reader of our output has gone, as in `navrep-data info DIR | head`
-        sys.stderr.close()
-        code = USAGE_ERROR
+        pass
     except Exception as error:
         text = _explain(error)
         if text is None or "--debug" in arguments:
             traceback.print_exc()
         if text:
             typer.echo(text, err=True)
-        code = USAGE_ERROR
-    sys.exit(code if isinstance(code, int) else 0)
+    _give_up_stdout_if_stuck()
+    sys.exit(code)
+
+
+def _run(arguments: list[str]) -> int:
+    """Run a verb and return its exit status; whatever it raises comes out, which typer's own ways would swallow."""
+    if not _folder_exists():
+        raise FileAccessError("The working folder does not exist any more; change to one that does: cd ~")
+    command = typer.main.get_command(app)
+    try:
+        with command.make_context("navrep-data", list(arguments)) as context:
+            command.invoke(context)
+    except typer.Exit as ended:
+        return int(ended.exit_code)
+    return 0
+
+
+def _folder_exists() -> bool:
+    """Return whether there is a working folder: half of all libraries ask for it when they are imported."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def _die_of_the_next_interrupt() -> None:
+    """Let a second Ctrl-C end the process at once, without a traceback out of whatever is being closed."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _give_up_stdout_if_stuck() -> None:
+    """Send what cannot be written nowhere, or Python would try again while it ends, and report that."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):  # a full disk, or nobody reads
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _explain(error: Exception) -> str | None:
     """Return one line for an error that has an explanation, None for one that is a bug of ours."""
+    if isinstance(error, OSError):
+        error = _explain_os_error(error)
     if isinstance(error, NavrepDataError):
         return f"Error: {error}"
     if not isinstance(error, _ClickException):
@@ -126,6 +178,16 @@ def _explain(error: Exception) -> str | None:
         text = text.split(". ")[0] + "." + did_you_mean(text.split("'")[1], context.command.commands)
     end = "" if text.endswith("?") else "."
     return f"Error: {text.rstrip('.')}{end} See: {context.command_path} --help"
+
+
+def _explain_os_error(error: OSError) -> Exception:
+    """Return an error of ours for one of the operating system, whoever raised it."""
+    if error.filename is None and not isinstance(error, NavrepDataError):
+        try:
+            sys.stdout.flush()
+        except OSError as stuck:  # so it was typer, printing help
+            return refused_output(stuck)
+    return translate_os_error(error)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data.errors import CorruptDataError, NavrepDataError
+from navrep_data.io import raise_refusal
 
 STORAGE = (".db3", ".mcap")
 _ROS1 = b"#ROSBAG"
@@ -143,6 +144,8 @@ def explained(path: Path) -> Iterator[None]:
     except (NavrepDataError, PermissionError):
         raise
     except Exception as error:  # damaged bags make the library raise nearly anything
+        if not isinstance(error, FileNotFoundError):  # one that the bag names
+            raise_refusal(error, path)
         raise CorruptDataError(f"{path} cannot be read as a ROS bag ({_said(error)}); {_remedy(path)}") from error
 
 

@@ -24,7 +24,7 @@ from navrep_data.datasets._batch import Assembler, BatchSpec
 from navrep_data.datasets._index import Ints, WindowTable, across_episodes, within_episodes
 from navrep_data.datasets._windows import Batch, check_choice, check_rows
 from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, SchemaVersionError, one_line
-from navrep_data.io import atomic_write_bytes, json_bytes, read_json, safe_join, sha256_bytes
+from navrep_data.io import atomic_write_bytes, json_bytes, read_json, reading, safe_join, sha256_bytes
 from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, SensorContract
 from navrep_data.shards import SPLITS, Episodes, shard_file
 
@@ -202,7 +202,8 @@ def read_latent_shard(root: Path, shard: LatentShard, z_size: int) -> dict[str, 
         raise CorruptDataError(
             f"{path} is missing or does not have {shard.bytes:,} bytes; run the encode command again."
         )
-    data = path.read_bytes()
+    with reading(path):
+        data = path.read_bytes()
     if sha256_bytes(data) != shard.sha256:
         raise CorruptDataError(f"{path} does not have the SHA-256 of the manifest; run the encode command again.")
     columns: dict[str, Array] = {}

@@ -20,7 +20,7 @@ from navrep_data.errors import (
     DatasetError,
     DatasetNotFoundError,
 )
-from navrep_data.io import new_folder, sha256_file
+from navrep_data.io import new_folder, raise_refusal, sha256_file
 from navrep_data.io.npz import PLAIN_METHODS
 from navrep_data.observations import scan_to_rings
 from navrep_data.schema import (
@@ -120,6 +120,7 @@ def _load(path: Path, read: bool = True) -> tuple[int, Arrays]:
     except DatasetError:
         raise
     except Exception as error:  # damaged archives raise a dozen kinds, struct.error and zlib.error among them
+        raise_refusal(error, path)
         raise CorruptDataError(
             f"{path} cannot be read as npz ({error}). Expected a file of the original software: "
             "is it written or copied completely?"

@@ -15,6 +15,7 @@ from navrep_data.errors import NavrepDataError, WorkerDiedError
 from navrep_data.evaluate.policies import PilotSpec
 from navrep_data.evaluate.runner import Episode, n_worlds, play, units
 from navrep_data.evaluate.suites import Suite, get_suite
+from navrep_data.io import translate_os_error, without_interrupts
 
 POLL_SECONDS = 0.2
 # workers hand over what they have finished this often, so that little is lost when they are killed
@@ -112,6 +113,8 @@ def _work(job: Job, share: int, taken: Any, results: Any) -> None:
         results.put(("end", None))
     except NavrepDataError as error:
         results.put(("error", error))
+    except OSError as error:
+        results.put(("error", translate_os_error(error)))
     except Exception:  # a bug: its traceback must reach the user
         results.put(("bug", traceback.format_exc()))
 
@@ -122,8 +125,9 @@ def _run_pool(job: Job, workers: int, n_units: int) -> Iterator[list[Episode]]:
     share = -(-len(job.episodes) // workers)
     pool = [context.Process(target=_work, args=(job, share, taken, results), daemon=True) for _ in range(workers)]
     try:
-        for process in pool:
-            process.start()
+        with without_interrupts():
+            for process in pool:
+                process.start()
         running = workers
         while running:
             try:

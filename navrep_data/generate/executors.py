@@ -23,6 +23,7 @@ from navrep_data.generate.worker import (
     run_task,
     start_worker,
 )
+from navrep_data.io import without_interrupts
 from navrep_data.shards import ShardEntry
 
 # A worker that somebody kills is replaced; a task that kills its worker this often is at fault itself.
@@ -130,7 +131,8 @@ class LocalExecutor:
             while True:
                 while free and (task := next(waiting, None)) is not None:
                     task = replace(task, slot=free.pop())
-                    running[pool.submit(run_task, task)] = task
+                    with without_interrupts():  # this may start a process
+                        running[pool.submit(run_task, task)] = task
                 if not running:
                     return
                 for future in wait(running, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED).done:

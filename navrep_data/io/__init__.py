@@ -7,7 +7,9 @@ from navrep_data.io._files import (
     cache_dir,
     fsync_dir,
     json_bytes,
+    raise_refusal,
     read_json,
+    reading,
     safe_join,
     sha256_bytes,
     sha256_file,
@@ -15,6 +17,7 @@ from navrep_data.io._files import (
 )
 from navrep_data.io.download import FileId, download, git_blob_sha1, is_offline, switched_off
 from navrep_data.io.folders import new_folder
+from navrep_data.io.interrupts import without_interrupts
 
 __all__ = [
     "PART_SUFFIX",
@@ -28,10 +31,13 @@ __all__ = [
     "is_offline",
     "json_bytes",
     "new_folder",
+    "raise_refusal",
     "read_json",
+    "reading",
     "safe_join",
     "sha256_bytes",
     "sha256_file",
     "switched_off",
     "translate_os_error",
+    "without_interrupts",
 ]

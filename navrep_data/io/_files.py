@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import json
@@ -9,12 +10,20 @@ import math
 import os
 import re
 import secrets
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import platformdirs
 
-from navrep_data.errors import CorruptDataError, DatasetError, DiskSpaceError, FolderNotWritableError
+from navrep_data.errors import (
+    CorruptDataError,
+    DatasetError,
+    DiskSpaceError,
+    FileAccessError,
+    FolderNotWritableError,
+    NavrepDataError,
+)
 
 PART_SUFFIX = ".part"
 HASH_BLOCK = 1 << 20
@@ -27,6 +36,22 @@ _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 # What the operating system says when there is no room: disk full, quota used up, file size limit.
 _NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _NOT_ALLOWED = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+# What no content of a file can cause; a damaged one makes libraries seek to nowhere, which is EINVAL.
+_REFUSALS = _NO_ROOM | _NOT_ALLOWED | {
+    errno.EIO, errno.ENAMETOOLONG, errno.ELOOP, errno.EMFILE, errno.ENFILE, errno.ENOENT, errno.ENOTDIR, errno.EISDIR,
+    errno.EBUSY, errno.ENXIO, errno.ENODEV, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN,
+}  # fmt: skip
+_EXPECTED = {
+    errno.EACCES: "Expected a file or folder that this user may use: change its permissions or choose another.",
+    errno.EPERM: "Expected a file or folder that this user may use: change its permissions or choose another.",
+    errno.ENAMETOOLONG: "Expected a shorter name: most file systems allow 255 bytes, .part and the like included.",
+    errno.ENOENT: "Expected something that exists: check the name, and that nobody removes it meanwhile.",
+    errno.ENOTDIR: "Expected a folder where a file is: choose another.",
+    errno.EISDIR: "Expected a file where a folder is: choose another.",
+    errno.EMFILE: "Expected to open more files at once: raise the limit, as in: ulimit -n 4096",
+    errno.EIO: "The disk or its connection fails; the file may be well: try again, or copy it from elsewhere.",
+}
+_EXPECTED_ELSE = "Expected a file or folder that can be used: look at its disk and permissions, or choose another."
 
 
 def cache_dir() -> Path:
@@ -55,19 +80,73 @@ def fsync_dir(folder: Path) -> None:
         os.close(handle)
 
 
-def translate_os_error(error: OSError, path: Path) -> Exception:
-    """Turn an operating-system error while writing `path` into one that says what to do."""
+def raise_refusal(error: BaseException, path: Path | str) -> None:
+    """Raise FileAccessError if the operating system refused to read `path`: that says nothing about what is in it.
+
+    For readers that take whatever else a library raises for damage. That a file is missing is raised as it came.
+
+    Parameters
+    ----------
+    error : BaseException
+        What was raised while `path` was read; what caused it counts too.
+    path : path-like
+        For the message, where the error does not name a file.
+    """
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, FileNotFoundError):
+            if cause is error:
+                raise cause
+        elif isinstance(cause, OSError) and cause.errno in _REFUSALS:
+            cause.filename = cause.filename or str(path)
+            raise translate_os_error(cause) from error
+        cause = cause.__cause__ or cause.__context__
+
+
+def translate_os_error(error: OSError, path: Path | None = None) -> Exception:
+    """Turn an error of the operating system into one that says in one line what to do.
+
+    Parameters
+    ----------
+    error : OSError
+        What was raised.
+    path : pathlib.Path, optional
+        What was being written; where it is left out nothing is known of what was done to ``error.filename``.
+
+    Returns
+    -------
+    Exception
+        An error of this package; `error` itself if it is one, or did not come from the operating system.
+    """
+    if isinstance(error, NavrepDataError) or error.errno is None:
+        return error
+    why = error.strerror or errno.errorcode.get(error.errno, f"error {error.errno}")
     if error.errno in _NO_ROOM:
         return DiskSpaceError(
-            f"No room left while writing {path}: {error.strerror}. "
+            f"No room left while writing{'' if path is None else f' {path}'}: {why}. "
             "What was finished is intact; free some space and run the same command again."
         )
-    if error.errno in _NOT_ALLOWED:
+    if error.errno in _NOT_ALLOWED and path is not None:
         return FolderNotWritableError(
-            f"Cannot write {path}: {error.strerror}. Expected a folder that this user may write; "
+            f"Cannot write {path}: {why}. Expected a folder that this user may write; "
             "choose another with --out or change its permissions."
         )
-    return error
+    where = error.filename if path is None or error.errno == errno.ENAMETOOLONG else path
+    what = "The operating system refuses" if where is None else f"The operating system refuses {os.fsdecode(where)}"
+    return FileAccessError(f"{what}: {why}. {_EXPECTED.get(error.errno, _EXPECTED_ELSE)}")
+
+
+@contextlib.contextmanager
+def reading(path: Path | str) -> Iterator[None]:
+    """Raise FileAccessError if the operating system refuses something while `path` is read in the ``with``.
+
+    That a file is missing stays FileNotFoundError, which callers may expect.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise_refusal(error, path)
+        raise
 
 
 def atomic_write_bytes(path: Path | str, data: bytes | memoryview) -> None:
@@ -132,6 +211,8 @@ def read_json(path: Path | str, max_bytes: int = MAX_JSON_BYTES) -> Any:
 
     Raises
     ------
+    FileAccessError
+        If it cannot be read.
     DatasetError
         If the file is too large.
     CorruptDataError
@@ -139,11 +220,14 @@ def read_json(path: Path | str, max_bytes: int = MAX_JSON_BYTES) -> Any:
         objects that they would take far more memory than the file has bytes.
     """
     path = Path(path)
-    size = path.stat().st_size
-    if size > max_bytes:
-        raise DatasetError(f"{path} has {size:,} bytes, expected at most {max_bytes:,}: not a file of this package.")
-    try:
+    with reading(path):
+        size = path.stat().st_size
+        if size > max_bytes:
+            raise DatasetError(
+                f"{path} has {size:,} bytes, expected at most {max_bytes:,}: not a file of this package."
+            )
         data = path.read_bytes()
+    try:
         containers = data.count(b"[") + data.count(b"{")
         if containers > _FREE_CONTAINERS + len(data) // _BYTES_PER_CONTAINER:
             raise ValueError(f"{containers:,} lists and objects in {len(data):,} bytes")
@@ -181,7 +265,7 @@ def sha256_bytes(data: bytes | memoryview) -> str:
 def sha256_file(path: Path | str) -> str:
     """Return the SHA-256 of a file's content as 64 hex digits, read in blocks of 1 MiB."""
     digest = hashlib.sha256()
-    with open(path, "rb", buffering=0) as handle:
+    with reading(path), open(path, "rb", buffering=0) as handle:
         while block := handle.read(HASH_BLOCK):
             digest.update(block)
     return digest.hexdigest()

@@ -214,6 +214,8 @@ class Manifest:
         ------
         DatasetNotFoundError
             If there is no folder or no manifest in it.
+        FileAccessError
+            If it is not readable.
         SchemaVersionError
             If it is of a newer format version.
         CorruptDataError
@@ -226,13 +228,7 @@ class Manifest:
             raise DatasetNotFoundError(
                 f"No dataset in {root}: it {seen}. Expected a folder written by `navrep-data generate --out {root}`."
             )
-        try:
-            values = read_json(path)
-        except OSError as error:
-            raise CorruptDataError(
-                f"{path} cannot be read ({error.strerror}); check its permissions or get it again."
-            ) from error
-        return cls.from_dict(values, root)
+        return cls.from_dict(read_json(path), root)
 
     @classmethod
     def from_dict(cls, values: Any, root: Path) -> Manifest:

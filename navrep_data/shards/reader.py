@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from navrep_data.errors import CorruptDataError, DatasetNotFoundError, SchemaVersionError
+from navrep_data.io import raise_refusal, reading
 from navrep_data.schema import COLUMNS, FORMAT_NAME, FORMAT_VERSION, SensorContract
 from navrep_data.shards._attributes import read_attribute
 from navrep_data.shards._codec import inflate, unshuffle
@@ -122,6 +123,7 @@ class Shard:
         except SchemaVersionError:
             raise
         except Exception as error:  # a damaged file makes the HDF5 library raise nearly anything
+            raise_refusal(error, self.path)
             raise self._corrupt(f"is not readable as HDF5 ({_first_line(error)})") from error
         if expected is not None and (self.rows, self.sequences) != (expected.rows, tuple(expected.sequences)):
             raise self._corrupt(
@@ -356,7 +358,8 @@ class Shard:
         if last is not None and last[0] == k:
             return last[1]
         size = int(chunked.sizes[k])
-        data = os.pread(self._descriptor(), size, int(chunked.offsets[k]))
+        with reading(self.path):
+            data = os.pread(self._descriptor(), size, int(chunked.offsets[k]))
         try:
             if len(data) != size:
                 raise ValueError("the file ends before it")
@@ -417,6 +420,7 @@ class Shard:
             with h5py.File(self.path, "r") as file:
                 values: Array = file[column][start:stop]
         except Exception as error:
+            raise_refusal(error, self.path)
             raise self._corrupt(f"is damaged: column {column!r}: {_first_line(error)}") from error
         return values
 

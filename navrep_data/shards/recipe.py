@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 
 from navrep_data.errors import CorruptDataError
+from navrep_data.io import raise_refusal
 from navrep_data.schema import FORMAT_NAME
 from navrep_data.shards._attributes import read_attribute
 
@@ -56,4 +57,5 @@ def read_recipe(path: Path | str) -> ShardRecipe:
             raise ValueError("its attributes are not those of a shard")
         return ShardRecipe(str(values["env"]), json.loads(values["config"]), int(values["seed"]), int(values["length"]))
     except Exception as error:  # a damaged file makes the HDF5 library raise nearly anything
+        raise_refusal(error, path)
         raise CorruptDataError(f"{path} cannot be read as a shard ({error}); get it again or make it again.") from error

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from navrep_data.errors import NavrepDataError, one_line
+from navrep_data.errors import FileAccessError, NavrepDataError, one_line
 from navrep_data.io import json_bytes, safe_join, sha256_bytes, sha256_file
 from navrep_data.observations import scan_to_rings
 from navrep_data.shards.card import dataset_card
@@ -114,6 +114,8 @@ def verify(root: Path | str, *, progress: Callable[[int, int], None] | None = No
         If it is of a newer format version.
     CorruptDataError
         If the manifest itself is damaged, so that nothing can be checked against it.
+    FileAccessError
+        If the operating system refuses to read a file, so that nothing can be said of it.
     """
     root = Path(root)
     manifest = Manifest.read(root)
@@ -225,6 +227,8 @@ def _check_shard(root: Path, manifest: Manifest, entry: ShardEntry) -> Iterator[
             return
         starts = yield from _check_rows(shard, manifest, entry)
         shard.close()
+    except FileAccessError:  # not what is in the file
+        raise
     except (NavrepDataError, OSError) as error:
         yield Problem(entry.file, str(error))
         return

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from isal import isal_zlib
 
 from navrep_data.errors import CorruptDataError
+from navrep_data.io import reading
 from navrep_data.io.npz import PLAIN_METHODS
 
 MAX_WORLDS_BYTES = 256 << 20
@@ -354,7 +355,9 @@ def read_worlds(path: Path | str) -> Worlds:
         If it is no worlds file, or larger than 256 MiB.
     """
     path = Path(path)
-    size = path.stat().st_size
-    if size > MAX_WORLDS_BYTES:
-        raise CorruptDataError(f"{path} has {size:,} bytes, expected at most {MAX_WORLDS_BYTES:,}; {_ADVICE}.")
-    return parse_worlds(path.read_bytes(), str(path))
+    with reading(path):
+        size = path.stat().st_size
+        if size > MAX_WORLDS_BYTES:
+            raise CorruptDataError(f"{path} has {size:,} bytes, expected at most {MAX_WORLDS_BYTES:,}; {_ADVICE}.")
+        data = path.read_bytes()
+    return parse_worlds(data, str(path))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from navrep_data.errors import MapError, MissingExtraError
+from navrep_data.io import raise_refusal
 
 EXTRA_PACKAGE = "asl_pepper_2d_sim_maps"
 PIP_COMMAND = 'pip install "navrep-data[maps]"'
@@ -127,6 +128,7 @@ def read_description(path: Path, *, packaged: bool = False) -> MapDescription:
     try:
         content = yaml.load(path.read_bytes(), _MapLoader)  # a SafeLoader
     except Exception as error:  # values such as `!!int ''` make PyYAML raise nearly anything
+        raise_refusal(error, path)
         raise MapError(f"{path} is not valid YAML ({error}): expected a map_server map file.") from error
     if not isinstance(content, dict):
         raise MapError(f"{path} holds {type(content).__name__}, expected keys {', '.join(_REQUIRED)}: no map file.")
@@ -244,6 +246,7 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
             f"{path} has far more pixels than expected, at most {MAX_PIXELS:,}: crop it or halve its resolution."
         ) from error
     except Exception as error:  # damaged images make pillow raise nearly anything, struct.error and KeyError among it
+        raise_refusal(error, path)
         raise MapError(f"{path} cannot be read as an image ({error}): expected a PGM or PNG of 8-bit grey.") from error
 
 

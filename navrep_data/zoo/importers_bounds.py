@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from navrep_data.errors import CheckpointError
+from navrep_data.io import raise_refusal
 from navrep_data.io.npz import PLAIN_METHODS
 
 HEADROOM = 1 << 16
@@ -38,6 +39,7 @@ def zip_members(path: Path, limit: int) -> dict[str, zipfile.ZipInfo]:
         with zipfile.ZipFile(path) as archive:
             infos = archive.infolist()
     except Exception as error:  # damaged archives raise a dozen kinds, struct.error among them
+        raise_refusal(error, path)
         raise CheckpointError(f"{path} is no zip file ({error}); pickles are never read, so expected a zip.") from error
     total = sum(info.file_size for info in infos)
     members = {info.filename: info for info in infos}
@@ -57,4 +59,5 @@ def read_member(path: Path, info: zipfile.ZipInfo) -> bytes:
         with zipfile.ZipFile(path) as archive, archive.open(info) as member:
             return member.read(info.file_size)
     except Exception as error:  # zlib.error among them
+        raise_refusal(error, path)
         raise CheckpointError(f"{path}: {info.filename!r} cannot be unpacked ({error}).") from error

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from navrep_data.errors import CheckpointError
+from navrep_data.io import raise_refusal
 from navrep_data.models import checkpoint
 from navrep_data.models.config import JointConfig, TransformerConfig
 from navrep_data.models.world_model import WorldModel
@@ -57,6 +58,7 @@ def load_torch_world_model(path: Path | str) -> WorldModel:
     try:
         loaded = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as error:  # a damaged pickle makes torch raise nearly anything
+        raise_refusal(error, path)
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise CheckpointError(
             f"{path} is no plain torch state dict, and nothing else is read from pickles ({reason})."

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data.errors import ConfigError, CorruptDataError, NavrepDataError
+from navrep_data.io import raise_refusal
 from navrep_data.io.npz import read_npz
 from navrep_data.zoo.fetching import Source, locate, missing_here
 from navrep_data.zoo.names import WILDCARDS
@@ -298,6 +299,7 @@ def _arrays(path: Path) -> dict[str, Any]:
         with open(path, "rb") as file:
             return read_npz(file, _MAX_GOLDEN_BYTES)
     except (OSError, ValueError) as error:
+        raise_refusal(error, path)
         raise CorruptDataError(f"{path} is no npz file ({error}): get the golden outputs again.") from error
 
 
