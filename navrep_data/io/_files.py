@@ -51,6 +51,7 @@ _EXPECTED = {
     errno.EMFILE: "Expected to open more files at once: raise the limit, as in: ulimit -n 4096",
     errno.EIO: "The disk or its connection fails; the file may be well: try again, or copy it from elsewhere.",
 }
+_LONGEST_REASON = 80
 _EXPECTED_ELSE = "Expected a file or folder that can be used: look at its disk and permissions, or choose another."
 
 
@@ -120,7 +121,9 @@ def translate_os_error(error: OSError, path: Path | None = None) -> Exception:
     """
     if isinstance(error, NavrepDataError) or error.errno is None:
         return error
-    why = error.strerror or errno.errorcode.get(error.errno, f"error {error.errno}")
+    why = error.strerror
+    if not why or len(why) > _LONGEST_REASON:  # the HDF5 library puts its whole story there
+        why = os.strerror(error.errno)
     if error.errno in _NO_ROOM:
         return DiskSpaceError(
             f"No room left while writing{'' if path is None else f' {path}'}: {why}. "

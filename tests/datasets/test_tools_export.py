@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +14,7 @@ from test_import_npz import ORIGINAL, sequence, write
 
 from navrep_data.datasets import import_npz
 from navrep_data.datasets.tools import export, filter, original_arrays
-from navrep_data.errors import ConfigError, FolderInUseError, MissingExtraError
+from navrep_data.errors import ConfigError, DiskSpaceError, FolderInUseError, MissingExtraError
 from navrep_data.schema import Event
 from navrep_data.shards import DatasetFolder, Manifest
 from navrep_data.testing import tiny_dataset
@@ -173,5 +176,42 @@ def test_nothing_is_overwritten(generated, tmp_path):
 def test_minari_is_optional(generated, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "minari", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'navrep-data\[minari\]'"):
+        export(generated, tmp_path / "out", format="minari")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_minari_takes_a_relative_folder(generated, tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    monkeypatch.chdir(tmp_path)
+    result = export(os.path.relpath(generated, tmp_path), "minari", format="minari")
+    assert result.root == "minari"
+    monkeypatch.setenv("MINARI_DATASETS_PATH", "minari")
+    assert len(minari.load_dataset(result.dataset_id)) == result.episodes
+    assert [p.name for p in tmp_path.iterdir()] == ["minari"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="bounds the size of files as Linux does")
+def test_a_full_disk_is_one_line_and_leaves_nothing(generated, tmp_path):
+    """The HDF5 library fails while it closes its file, and crashes its process afterwards."""
+    pytest.importorskip("minari")
+    program = (
+        "import resource, sys\nresource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
+        "from navrep_data.cli.main import run\nrun(sys.argv[1:])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, "export", generated, "--format", "minari", "--out", tmp_path / "out"],
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert done.stderr.startswith("Error: No room left while writing ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_space_for_minari_is_checked_before_anything_is_written(generated, tmp_path, monkeypatch):
+    pytest.importorskip("minari")
+    monkeypatch.setattr("shutil.disk_usage", lambda _: types.SimpleNamespace(free=1000))
+    with pytest.raises(DiskSpaceError, match="1,000 are free"):
         export(generated, tmp_path / "out", format="minari")
     assert list(tmp_path.iterdir()) == []

@@ -71,11 +71,15 @@ class Piece:
     split: str | None
     source: SequenceSource
 
+    def columns(self) -> Arrays:
+        """Return all columns as they are stored."""
+        given = self.given
+        given.check(self.shard)
+        return {name: given.folder.read(name, self.shard, self.start, self.stop) for name in given.manifest.columns}
+
     def read(self, number: int, max_humans: int) -> tuple[Arrays, Arrays | None]:
         """Return columns and worlds, as those of sequence `number` with `max_humans` slots."""
-        self.given.check(self.shard)
-        folder = self.given.folder
-        columns = {name: folder.read(name, self.shard, self.start, self.stop) for name in self.given.manifest.columns}
+        columns = self.columns()
         columns["sequence"][:] = number
         first_episode = columns["episode"][0]
         columns["episode"] -= first_episode

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import io
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from navrep_data._version import __version__
 from navrep_data.datasets.npz import FILE_SUFFIX, unplayed_frames
-from navrep_data.datasets.tools._pieces import Given, Piece, Progress
+from navrep_data.datasets.tools._pieces import Given, Progress
+from navrep_data.datasets.tools.minari_process import write_apart
 from navrep_data.errors import ConfigError, MissingExtraError, did_you_mean
 from navrep_data.io import atomic_write_bytes, new_folder
 from navrep_data.observations import metres_from_millimetres
-from navrep_data.schema import ACTION_SIZE, N_RAYS, ROBOT_STATE_SIZE, Event
+from navrep_data.schema import ACTION_SIZE, N_RAYS, Event
 
 Arrays = dict[str, npt.NDArray[Any]]
 FORMATS = ("npz", "minari")
@@ -28,7 +28,6 @@ MIN_DIGITS = 3
 """Digits of the number in the name of an npz file; more where there are more sequences."""
 # What Minari calls a dataset: (namespace/)name-vN; also a relative path, so nothing that could lead elsewhere.
 _MINARI_ID = re.compile(r"([A-Za-z0-9][\w-]*/)*[A-Za-z0-9][\w-]*-v\d{1,6}")
-_INFOS = ("event", "sequence", "robot_pose", "robot_radius", "humans")
 
 
 @dataclass(frozen=True)
@@ -102,6 +101,8 @@ def export(
         If Minari is not installed.
     FolderInUseError
         If `out` holds something.
+    DiskSpaceError, FolderNotWritableError
+        If it cannot be written.
     DatasetNotFoundError, DatasetError, CorruptDataError
         If the dataset cannot be read.
 
@@ -175,19 +176,13 @@ def _npz_files(part: Path, given: Given, progress: Progress | None) -> dict[str,
     # files are imported in the order of their names
     digits = max(MIN_DIGITS, len(str(given.manifest.shards[-1].sequences[1] - 1)))
     for k, piece in enumerate(pieces):
-        columns = _columns(piece)
+        columns = piece.columns()
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **original_arrays(columns))  # type: ignore[arg-type]
         atomic_write_bytes(part / f"{int(columns['sequence'][0]):0{digits}}_{FILE_SUFFIX}", buffer.getvalue())
         if progress is not None:
             progress(k + 1, len(pieces))
     return {"episodes": len(given.folder.episodes), "rows": given.manifest.rows}
-
-
-def _columns(piece: Piece) -> Arrays:
-    given = piece.given
-    given.check(piece.shard)
-    return {name: given.folder.read(name, piece.shard, piece.start, piece.stop) for name in given.manifest.columns}
 
 
 # -- Minari
@@ -199,75 +194,11 @@ def _minari_files(given: Given, dataset_id: str | None) -> Callable[..., dict[st
     name = dataset_id or f"navrep-data/{re.sub(r'[^A-Za-z0-9_-]', '-', m.env)}-v0"
     if not _MINARI_ID.fullmatch(name):
         raise ConfigError(f"{name!r} is no name for Minari; expected namespace/name-v0 of letters, digits, - and _.")
-    try:
-        spaces = importlib.import_module("gymnasium.spaces")
-        storage = importlib.import_module("minari.dataset.minari_storage").MinariStorage
-        buffer = importlib.import_module("minari.data_collector").EpisodeBuffer
-        version = importlib.import_module("minari").__version__
-    except ImportError:
-        raise MissingExtraError("Minari is not installed; get it: pip install 'navrep-data[minari]'") from None
+    if importlib.util.find_spec("minari") is None:
+        raise MissingExtraError("Minari is not installed; get it: pip install 'navrep-data[minari]'")
 
     def write(part: Path, given: Given, progress: Progress | None) -> dict[str, Any]:
-        folder = part / name / "data"
-        folder.mkdir(parents=True)
-        everywhere = np.float32(np.inf)
-        observed = {
-            "scan": spaces.Box(np.float32(0), np.float32(m.sensor.range_max), (m.sensor.n_rays,), np.float32),
-            "robot_state": spaces.Box(-everywhere, everywhere, (ROBOT_STATE_SIZE,), np.float32),
-        }
-        made = storage.new(
-            folder,
-            observation_space=spaces.Dict(observed),
-            action_space=spaces.Box(-everywhere, everywhere, (ACTION_SIZE,), np.float32),
-        )
-        made.update_metadata(
-            {
-                "dataset_id": name,
-                "algorithm_name": str(m.policy.get("name", "unknown")),
-                "description": f"navrep-data {m.env}, {m.physics} physics. Made by: {m.command}",
-                "minari_version": version,
-                "requirements": [f"navrep-data=={__version__}"],
-            }
-        )
-        splits: list[str] = []
-        skipped = 0
-
-        def buffers() -> Iterator[Any]:
-            nonlocal skipped
-            pieces = given.pieces()
-            for k, piece in enumerate(pieces):
-                columns = _columns(piece)
-                starts = np.flatnonzero(columns["is_first"])
-                for start, stop in zip(starts, np.append(starts[1:], len(columns["step"])), strict=True):
-                    if stop - start < 2:
-                        skipped += 1
-                        continue
-                    splits.append(str(piece.split))
-                    yield buffer(**_minari_episode({c: v[start:stop] for c, v in columns.items()}))
-                if progress is not None:
-                    progress(k + 1, len(pieces))
-
-        made.update_episodes(buffers())
-        made.update_episode_metadata([{"split": one} for one in splits])
-        rows = m.rows - skipped
-        return {"episodes": len(splits), "rows": rows, "skipped": skipped, "dataset_id": name}
+        # both absolute: Minari joins what it is given once more, and another process does it
+        return write_apart(given.root.resolve(), part.resolve(), name, progress)
 
     return write
-
-
-def _minari_episode(rows: Arrays) -> dict[str, Any]:
-    """Return the fields of Minari's buffer for one episode."""
-    scan, ended = rows["scan"], np.zeros(len(rows["step"]) - 1, bool)
-    ended[-1] = True
-    terminal = bool(rows["is_terminal"][-1])
-    return {
-        "observations": {
-            "scan": metres_from_millimetres(scan) if scan.dtype == np.uint16 else scan,
-            "robot_state": rows["robot_state"],
-        },
-        "actions": rows["action"][:-1],
-        "rewards": rows["reward"][:-1],
-        "terminations": ended & terminal,
-        "truncations": ended & (not terminal),
-        "infos": {name: rows[name] for name in _INFOS if name in rows},
-    }
