@@ -3,8 +3,10 @@
 import builtins
 import importlib
 import inspect
+from pathlib import Path
 
 import pytest
+import yaml
 
 import navrep_data
 from navrep_data import errors
@@ -49,3 +51,9 @@ def test_tiny_dataset_is_real(tmp_path):
     assert set(manifest.splits) == {"train", "val", "test"}
     assert verify(root).ok
     assert tiny_dataset(tmp_path / "tiny") == root
+
+
+def test_the_citation_names_the_paper_on_arxiv():
+    cited = yaml.safe_load((Path(__file__).resolve().parents[1] / "CITATION.cff").read_text())["preferred-citation"]
+    assert {"type": "other", "value": "arXiv:2012.04406"}.items() <= cited["identifiers"][0].items()
+    assert cited["url"] == "https://arxiv.org/abs/2012.04406"

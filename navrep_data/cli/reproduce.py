@@ -27,7 +27,13 @@ def reproduce_command(
         ),
     ] = Path("benchmark"),
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="What to write.", show_default="DIR/FIGURE.png (.md)")
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE",
+            help="What to write: .png, .pdf, .svg; a table .md, .tex, .csv.",
+            show_default="DIR/FIGURE.png (.md)",
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:

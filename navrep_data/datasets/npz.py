@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import platform
+import shlex
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -349,7 +350,10 @@ def _plan(files: Sequence[Path], lengths: Sequence[int], env: str, sensor: Senso
         config=config,
         policy={"name": "unknown"},
         versions={"navrep-data": __version__, "numpy": np.__version__, "python": platform.python_version()},
-        command=f"navrep-data import-npz {'DIR' if len(files) > 1 else files[0].name} --out OUT --env {env}",
+        command=shlex.join(
+            ["navrep-data", "import-npz", "DIR" if len(files) > 1 else files[0].name, "--out", "OUT", "--env", env]
+        )
+        + f" --range-max {sensor.range_max:g}",
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import platform
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -180,7 +181,11 @@ def import_rosbag(
     with new_folder(out, what="an import") as part:
         sensor = SensorContract(range_max=float(range_max), dt=float(dt))
         blind = _blind_rays(recordings, sensor, say)
-        manifest = _plan(recordings, env, sensor, length, rings, goal_radius, blind)
+        command = _command(
+            len(paths), env, sensor, length, goal_radius, reading,
+            {"--scan-topic": scan_topic, "--odometry-topic": odometry_topic, "--goal-topic": goal_topic},
+        )  # fmt: skip
+        manifest = _plan(recordings, env, sensor, length, rings, goal_radius, blind, command)
         return _write(part, manifest, recordings, rings, progress)
 
 
@@ -300,9 +305,30 @@ def _hash(path: Path) -> str:
     return sha256_bytes("".join(f"{p.relative_to(path).as_posix()} {sha256_file(p)}\n" for p in files).encode())
 
 
+def _command(
+    n: int,
+    env: str,
+    sensor: SensorContract,
+    length: int,
+    radius: float,
+    reading: Reading,
+    topics: dict[str, str | None],
+) -> str:
+    """Return the command line that makes the same dataset: for the card."""
+    words = ["navrep-data", "import-rosbag", *["BAG"] * n, "--out", "OUT", "--env", env]
+    words += ["--dt", f"{sensor.dt:g}", "--length", str(length), "--range-max", f"{sensor.range_max:g}"]
+    words += [word for flag, topic in topics.items() if topic is not None for word in (flag, topic)]
+    if any(reading.mount):
+        words += ["--mount", ",".join(f"{v:g}" for v in reading.mount)]
+    words += ["--goal-radius", f"{radius:g}"]
+    words += ["--assume-same-frame"] if reading.assume_same_frame else []
+    words += ["--invalid-is-free"] if reading.invalid_is_free else []
+    return shlex.join(words)
+
+
 def _plan(
     recordings: Sequence[_Recording], env: str, sensor: SensorContract, length: int, rings: bool, radius: float,
-    blind: list[list[int]],
+    blind: list[list[int]], command: str,
 ) -> Manifest:  # fmt: skip
     """Return the manifest of the dataset before any shard is written."""
     config = {
@@ -334,8 +360,7 @@ def _plan(
         config=config,
         policy={"name": "unknown"},
         versions={"navrep-data": __version__, "numpy": np.__version__, "python": platform.python_version()},
-        command=f"navrep-data import-rosbag {' '.join(['BAG'] * len(recordings))} --out OUT --env {env} "
-        f"--dt {sensor.dt:g} --length {length} --range-max {sensor.range_max:g}",
+        command=command,
     )
 
 

@@ -16,6 +16,12 @@ _MAX_LISTED = 1000
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 _SIZES_LARGE = ((10_000_000, "1M<n<10M"), (100_000_000, "10M<n<100M"), (1_000_000_000, "100M<n<1B"))
 
+_NOT_SIMULATED = {
+    "imported": "Imported from files of the original software: which simulator or robot made them is not recorded; "
+    "people, obstacles and the robot's radius are not known.",
+    "recorded": "Recorded with a robot: people, obstacles and the robot's radius are not known.",
+}
+"""By what a manifest says in place of physics."""
 _HUMANS = {
     "orca": "humans that follow ORCA",
     "planned": "humans that follow the shortest way round walls",
@@ -71,20 +77,29 @@ def _configs(m: Manifest) -> list[dict[str, Any]]:
     return [c if isinstance(c := record.get("config"), dict) else m.config for record in m.source] or [m.config]
 
 
-def _orca(m: Manifest) -> list[str]:
-    return ["orca"] if any(c.get("human_policy", "orca") == "orca" for c in _configs(m)) else []
+def _simulated(m: Manifest) -> bool:
+    """Return whether this package simulated it, and so knows all about it."""
+    return m.physics not in _NOT_SIMULATED
+
+
+def _crowd(m: Manifest) -> list[str]:
+    """Return the tags that say who is around."""
+    if not _simulated(m):
+        return []
+    return ["crowd", *(["orca"] if any(c.get("human_policy", "orca") == "orca" for c in _configs(m)) else [])]
 
 
 def _front_matter(m: Manifest) -> str:
+    which = f"{m.physics} physics, seed {m.seed}" if _simulated(m) else m.physics
     lines = [
         "---",
         *([f"license: {m.license}"] if m.license else []),
-        f"pretty_name: {json.dumps(f'navrep-data {m.env} ({m.physics} physics, seed {m.seed})')}",
+        f"pretty_name: {json.dumps(f'navrep-data {m.env} ({which})')}",
         "task_categories:",
         "- reinforcement-learning",
         "- robotics",
         "tags:",
-        *(f"- {tag}" for tag in ("navrep", "robot-navigation", "lidar", "crowd", *_orca(m), "world-models", "hdf5")),
+        *(f"- {tag}" for tag in ("navrep", "robot-navigation", "lidar", *_crowd(m), "world-models", "hdf5")),
         "size_categories:",
         f"- {_size_category(m.rows)}",
         "configs:",
@@ -188,7 +203,24 @@ def _seed(m: Manifest) -> str:
 
 
 def _length(m: Manifest) -> str:
-    return f"at most {m.length:,}" if m.source else f"{m.length:,}"
+    return f"{m.length:,}" if m.rows == m.sequences * m.length else f"at most {m.length:,}"
+
+
+def _what(m: Manifest) -> str:
+    """Say what it holds, and where that is from."""
+    sequences = f"in {m.sequences:,} sequences of {_length(m)} steps"
+    if _simulated(m):
+        return (
+            f"{m.rows:,} steps of a robot among humans, {sequences}: lidar\n"
+            "scans, robot states, actions, rewards and the crowd behind them.\n"
+            f"Environment `{m.env}`, `{m.physics}` physics, {_seed(m)}."
+        )
+    made = "recorded with a robot" if m.physics == "recorded" else "imported from files of the original software"
+    return (
+        f"{m.rows:,} steps {made}, {sequences}: lidar\n"
+        "scans, robot states, actions and rewards. Nothing was simulated here.\n"
+        f"Called `{m.env}`" + (f", {_seed(m)}." if len(m.source) > 1 else ".")
+    )
 
 
 def _sources(m: Manifest) -> str:
@@ -202,12 +234,10 @@ def _sources(m: Manifest) -> str:
 
 
 def _limits(m: Manifest) -> str:
-    configs = _configs(m)
-    noise = "with noise" if any(c.get("scan_noise") or c.get("scan_dropout") for c in configs) else "without noise"
-    walks = [_HUMANS.get(str(c.get("human_policy", "orca")), "humans that follow a script") for c in configs]
-    lines = [f"* Simulated: flat ground, a planar lidar {noise}, {' or '.join(dict.fromkeys(walks))}."]
-    if m.physics == "recorded":
-        lines = ["* Recorded with a robot: people, obstacles and the robot's radius are not known."]
+    if not _simulated(m):
+        lines = [f"* {_NOT_SIMULATED[m.physics]}"]
+    else:
+        lines = _simulation_limits(m)
     if m.scan_dtype == "uint16":
         lines.append(
             "* Scans are rounded to millimetres: about 1 frame in 8 has one rings cell one bin off that of float32."
@@ -219,6 +249,29 @@ def _limits(m: Manifest) -> str:
         "`cut` marks episodes that the end of a sequence cut off.",
     ]
     return "\n".join(lines)
+
+
+def _simulation_limits(m: Manifest) -> list[str]:
+    configs = _configs(m)
+    noise = "with noise" if any(c.get("scan_noise") or c.get("scan_dropout") for c in configs) else "without noise"
+    walks = [_HUMANS.get(str(c.get("human_policy", "orca")), "humans that follow a script") for c in configs]
+    lines = [f"* Simulated: flat ground, a planar lidar {noise}, {' or '.join(dict.fromkeys(walks))}."]
+    if all(c.get("world") != "map" and c.get("human_policy", "orca") == "orca" for c in configs):
+        lines.append(
+            "* Half of all humans, drawn by chance (`human_sees_robot` in `worlds/`), do not see the robot and walk as "
+            "if it was not there, as in the original."
+        )
+    ended = {name: v["episodes"] for name, v in m.statistics.get("outcomes", {}).items() if name != "cut"}
+    played = sum(ended.values())
+    if m.policy.get("name") == "orca" and played and all(c.get("world") != "map" for c in configs):
+        walls = "it plans no way round walls" if any(c.get("obstacles") for c in configs) else ""
+        why = " and ".join(filter(None, [walls, "humans who do not see it walk into it"]))
+        lines.append(
+            f"* The robot arrives in {100 * ended.get('goal', 0) / played:.0f} % of the {played:,} episodes that "
+            f"ended: it follows ORCA straight to its goal, {why}. "
+            "This is data for world models, not driving to imitate."
+        )
+    return lines
 
 
 def dataset_card(manifest: Manifest) -> str:
@@ -245,15 +298,18 @@ def dataset_card(manifest: Manifest) -> str:
     )
     splits = [(n, f"{sum(b - a for a, b in m.splits.get(n, ())):,}") for n in SPLITS]
     scene = "map" if m.config.get("world") == "map" else "obstacles"
+    worlds = (
+        f"`worlds/` holds the {scene}, goals and start states of each episode, one npz per shard.\n\n"
+        if any(shard.worlds for shard in m.shards) or (not m.shards and _simulated(m))
+        else ""
+    )
     command = m.command or "(not recorded)"
     versions = ", ".join(f"{k} {v}" for k, v in m.versions.items())
     return f"""{_front_matter(m)}
 
 # navrep-data: {m.env}
 
-{_lead(m)}{m.rows:,} steps of a robot among humans, in {m.sequences:,} sequences of {_length(m)} steps: lidar
-scans, robot states, actions, rewards and the crowd behind them.
-Environment `{m.env}`, `{m.physics}` physics, {_seed(m)}.
+{_lead(m)}{_what(m)}
 {len(m.shards):,} HDF5 shards, {m.bytes:,} bytes ({m.bytes / max(m.rows, 1):,.0f} per step).
 
 {_maps_note(m)}Made by navrep-data, an independent re-implementation of the simulator of NavRep (Dugas et al. 2020);
@@ -277,9 +333,7 @@ anticlockwise; up to {m.sensor.range_max:g} m; one step is {m.sensor.dt:g} s.
 
 {_columns_table(all_layouts)}
 
-`worlds/` holds the {scene}, goals and start states of each episode, one npz per shard.
-
-## Outcomes
+{worlds}## Outcomes
 
 {_outcomes_table(m.statistics)}
 

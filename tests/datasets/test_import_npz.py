@@ -337,3 +337,9 @@ def test_range_max(tmp_path):
     assert SequenceDataset(tmp_path / "out", "1d")[0]["scan"][5, 5] == np.float32(109.44)
     with pytest.raises(ConfigError, match="expected positive numbers"):
         import_npz(folder, tmp_path / "other", range_max=0)
+
+
+def test_the_card_gives_the_whole_command(tmp_path):
+    manifest = import_npz(write(tmp_path / "in", sequence()), tmp_path / "d", env="my lab", range_max=30.0)
+    assert manifest.command.endswith("--out OUT --env 'my lab' --range-max 30")
+    assert manifest.command in (tmp_path / "d" / "README.md").read_text()

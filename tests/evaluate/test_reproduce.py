@@ -1,5 +1,6 @@
 """The paper's figures from results files: what is drawn from whom, and what is told where results are missing."""
 
+import csv
 import json
 import shutil
 from pathlib import Path
@@ -204,3 +205,42 @@ def test_bad_input(measured, tmp_path):
     with pytest.raises(CorruptDataError, match="is not a results file"):
         reproduce("table", measured)
     assert not Path(measured / "table.md").exists()
+
+
+def test_the_table_is_what_its_suffix_says(measured):
+    for name in ("t.tex", "t.csv"):
+        reproduce("table", measured, measured / name)
+    tex = (measured / "t.tex").read_text()
+    assert r"\begin{tabular}{lr" in tex
+    assert r"transformer\_rings\_z & 39.1 \% & " in tex
+    assert "|" not in tex.split("end{tabular}")[0]
+    with open(measured / "t.csv", newline="") as file:
+        rows = {(r["name"], r["source"]): r for r in csv.DictReader(file) if r["suite"] == "navrep27"}
+    assert float(rows["transformer_rings_z", "authors"]["value"]) == pytest.approx(0.391, abs=5e-4)
+    assert float(rows["e2e_1d", "released"]["value"]) == 0.5
+    assert rows["e2e_1d", "released"]["runs"].split() == ["e2e_1d.20201026", "e2e_1d.20201027"]
+
+
+def test_figures_are_drawn_for_papers_too(tmp_path):
+    (tmp_path / "a_z").mkdir()
+    (tmp_path / "a_z" / "log.csv").write_text("step,success,val_success\n100,,0.1\n200,,0.2\n")
+    for name, begins in (("f.pdf", b"%PDF-"), ("f.svg", b"<?xml"), ("f.PNG", b"\x89PNG")):
+        reproduce("fig-training", tmp_path, tmp_path / name)
+        data = (tmp_path / name).read_bytes()
+        assert data.startswith(begins)
+        reproduce("fig-training", tmp_path, tmp_path / name)
+        assert (tmp_path / name).read_bytes() == data  # no date, no random identifiers
+
+
+@pytest.mark.parametrize(
+    ("figure", "name", "words"),
+    [
+        ("table", "t.png", r"\.md, \.tex, \.csv"),
+        ("fig-training", "f.jpg", r"\.png, \.pdf, \.svg"),
+        ("table", "t", r"\.md"),
+    ],
+)
+def test_a_suffix_that_names_no_format_is_refused(figure, name, words, tmp_path):
+    with pytest.raises(ConfigError, match=f"ends in .*{words}"):
+        reproduce(figure, tmp_path, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []

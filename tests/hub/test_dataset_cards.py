@@ -90,6 +90,37 @@ def test_cards_of_maps_say_that_the_maps_have_no_licence(env):
     assert cards.PUBLISHED[env].license == ("other" if on_maps else "mit")  # nobody may licence others' maps
 
 
+@pytest.mark.parametrize("env", ENVS)
+def test_cards_say_how_seldom_the_robot_arrives_and_who_does_not_see_it(env):
+    """Where that is so; the share is the statistics' own, without the episodes that were cut."""
+    card, manifest = (FOLDER / f"{env}.md").read_text(), cards.read_published(FOLDER, env)
+    on_maps = env == "ian"
+    ended = {name: v["episodes"] for name, v in manifest.statistics["outcomes"].items() if name != "cut"}
+    share = f"arrives in {100 * ended['goal'] / sum(ended.values()):.0f} % of the {sum(ended.values()):,} episodes"
+    assert ("Half of all humans" in card) == (share in card) == (not on_maps)
+    assert env != "soadrl" or "arrives in 12 %" in card
+
+
+@pytest.mark.parametrize(("physics", "words"), [("imported", "original software"), ("recorded", "with a robot")])
+def test_cards_of_imports_say_what_they_are(physics, words):
+    made = cards.read_published(FOLDER, "soadrl")
+    shards = tuple(replace(s, worlds=None) for s in made.shards)
+    manifest = replace(
+        made, physics=physics, config={"source": []}, policy={"name": "unknown"}, length=1001, shards=shards, command=""
+    )
+    card = dataset_card(manifest)
+    _, front, body = card.split("---\n", 2)
+    head = yaml.safe_load(front)
+    assert not {"crowd", "orca"} & set(head["tags"])
+    assert head["pretty_name"] == f"navrep-data soadrl ({physics})"
+    lead = " ".join(body.split("## How")[0].split())
+    assert words in lead
+    assert "at most 1,001 steps" in lead
+    assert not any(
+        word in body for word in ("among humans", "crowd behind", "ORCA", "seed 0", "`worlds/`", "Half of all")
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("env", ENVS)
 def test_the_package_generates_what_the_card_describes(env, tmp_path):

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from navrep_data.errors import ConfigError, DatasetNotFoundError, did_you_mean
-from navrep_data.evaluate.figures import save
 from navrep_data.evaluate.reproduce.drawn import Drawn, Missing, Reproduced
+from navrep_data.evaluate.reproduce.formats import check_suffix, write
 from navrep_data.evaluate.reproduce.state import state
 from navrep_data.evaluate.reproduce.testing import table, testing, trajectories
 from navrep_data.evaluate.reproduce.training import training
 from navrep_data.evaluate.reproduce.world_models import world_models
-from navrep_data.io import atomic_write_bytes, translate_os_error
+from navrep_data.io import translate_os_error
 
 FIGURES: dict[str, Callable[[Path], Drawn]] = {
     "fig-state": state,
@@ -39,7 +39,8 @@ def reproduce(
         Folder that holds results at any depth: what ``navrep-data benchmark --out`` and ``evaluate world-model --out``
         wrote, output folders of trainings, datasets.
     out : path-like, optional
-        File to write; ``FIGURE.png`` (``table.md``) in `results` if left out.
+        File to write; ``FIGURE.png`` (``table.md``) in `results` if left out. Its suffix chooses the format: .png,
+        .pdf or .svg for figures; .md, .tex (with booktabs) or .csv (the numbers) for the table.
 
     Returns
     -------
@@ -49,7 +50,7 @@ def reproduce(
     Raises
     ------
     ConfigError
-        If there is no such figure.
+        If there is no such figure, or the suffix names no format.
     DatasetNotFoundError
         If `results` has nothing for it; says by which commands to make it.
     CorruptDataError
@@ -60,6 +61,8 @@ def reproduce(
             f"Unknown figure {figure!r}.{did_you_mean(figure, FIGURES)} Expected one of: {', '.join(FIGURES)}."
         )
     folder = Path(results)
+    if out is not None:
+        check_suffix(Path(out), figure == "table")
     drawn = FIGURES[figure](folder)
     if drawn.figure is None and drawn.text is None:
         commands = "; or: ".join(m.command for m in drawn.missing)
@@ -69,10 +72,7 @@ def reproduce(
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise translate_os_error(error, path.parent) from error
-    if drawn.text is not None:
-        atomic_write_bytes(path, drawn.text.encode())
-    else:
-        save(drawn.figure, path)
+    write(drawn, path)
     return Reproduced(figure, path, drawn.sources, drawn.missing, drawn.text)
 
 
