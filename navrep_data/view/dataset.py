@@ -95,7 +95,8 @@ def dataset_page(
         chosen = _choose(folder.manifest, sequences, Path(root))
         notes: list[str] = []
         if sequences is None and folder.manifest.sequences > len(chosen):
-            notes.append(f"{len(chosen)} of {folder.manifest.sequences:,} sequences; choose others with --sequence")
+            hidden = folder.manifest.sequences - len(chosen)
+            notes.append(f"{hidden:,} of {folder.manifest.sequences:,} sequences; choose others with --sequence")
         shown: list[dict[str, Any]] = []
         blobs: list[str] = []
         room = max_bytes - len(assemble("dataset", _meta(folder.manifest, name, [], notes), []))

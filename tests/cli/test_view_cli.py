@@ -35,7 +35,7 @@ def test_it_writes_a_page_and_prints_where(dataset, tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout == "crowd.view.html\n"
-    assert done.stderr == "left out: 3 of 4 sequences; choose others with --sequence\n"
+    assert done.stderr == "left out: 1 of 4 sequences; choose others with --sequence\n"
     assert (tmp_path / "crowd.view.html").read_text().startswith(MARK)
 
 

