@@ -96,6 +96,11 @@ def _open_folder(path: Path, ros2: Any, stack: contextlib.ExitStack, note: Calla
             f"{path} {reason}, and its files are compressed; expected both. Unpack them (unzstd {packed[0]}), "
             "then import the folder again."
         )
+    ros1 = sorted(item.name for item in path.glob("*.bag*"))
+    if not files and ros1:
+        raise CorruptDataError(
+            f"{path} cannot be read as a ROS bag (it is a folder); give the files in it: {ros1[0]} ..."
+        )
     if not files:
         raise CorruptDataError(
             f"{path} cannot be read as a ROS bag (it {reason} and holds no .db3 or .mcap); expected the folder of a "

@@ -338,6 +338,13 @@ def test_databases_that_were_not_closed(tmp_path):
             read(given, tmp_path / "d")
 
 
+def test_folders_of_ros1_bags(tmp_path):
+    (tmp_path / "lab").mkdir()
+    record(tmp_path / "lab" / "a", "ros1", seconds=1.0)
+    with pytest.raises(CorruptDataError, match=r"it is a folder\); give the files in it: a\.bag"):
+        read(tmp_path / "lab", tmp_path / "d")
+
+
 def test_compressed_files_without_metadata(tmp_path):
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "bag_0.db3.zstd").write_bytes(b"x")
