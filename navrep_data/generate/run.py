@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -11,6 +10,7 @@ from dataclasses import replace
 from tqdm import tqdm
 
 from navrep_data.errors import CorruptDataError, DatasetError, DatasetMismatchError, NavrepDataError
+from navrep_data.generate.compiling import Compiling
 from navrep_data.generate.executors import LocalExecutor, RayExecutor
 from navrep_data.generate.plan import Request, check_manifest, check_same, check_space, new_manifest, versions
 from navrep_data.generate.storage import check_storage, check_visible
@@ -23,7 +23,6 @@ MANIFEST_SECONDS = 0.5
 MANIFEST_SHARE = 0.05
 # On resume the newest finished shards are hashed again: what a power cut may have damaged.
 RECHECKED_SHARDS = 8
-COMPILE_NOTICE_SECONDS = 3.0
 
 Say = Callable[[str], None]
 
@@ -139,7 +138,7 @@ class Run:
             self.say(f"{self.home} already holds all {self.request.sequences} sequences; nothing to do.")
             return
         with make_executor(len(tasks)) as executor:
-            self._announce(done_rows, executor)
+            self._announce(done_rows, executor, progress)
             if self._entries or not (self.home / MANIFEST_FILE).exists():
                 self._save()
             self.began = time.perf_counter()
@@ -169,13 +168,13 @@ class Run:
                     self._save()
                 raise
 
-    def _announce(self, done_rows: int, executor: LocalExecutor | RayExecutor) -> None:
+    def _announce(self, done_rows: int, executor: LocalExecutor | RayExecutor, progress: bool) -> None:
         if self.say is silent:
             return  # the estimate costs a few hundred rows
         r, s = self.request, self.request.spec
         per_row = None
         if s.policy.scripted and executor.like_here:
-            with _Notice(self.say, "Compiling kernels (once, about 30 s)"):
+            with Compiling(self.say, progress):
                 per_row = seconds_per_row(s)
         todo = r.rows - done_rows
         place = s.storage or s.root
@@ -242,20 +241,6 @@ class Run:
         self.manifest = manifest.save(self.home, dataset_card(manifest) if whole else None)
         if whole:
             self.store.finish(self.root)
-
-
-class _Notice:
-    """Say something if the block takes long; numba does not tell beforehand whether it must compile."""
-
-    def __init__(self, say: Say, text: str) -> None:
-        self._timer = threading.Timer(COMPILE_NOTICE_SECONDS, say, (text,))
-        self._timer.daemon = True
-
-    def __enter__(self) -> None:
-        self._timer.start()
-
-    def __exit__(self, *_: object) -> None:
-        self._timer.cancel()
 
 
 def silent(_: str) -> None:

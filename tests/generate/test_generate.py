@@ -1,6 +1,7 @@
 """Datasets as files: bytes are a function of settings and seed, whatever happens on the way."""
 
 import dataclasses
+import gc
 import hashlib
 import json
 import os
@@ -13,6 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
@@ -27,6 +29,7 @@ from navrep_data.errors import (
     SchemaVersionError,
 )
 from navrep_data.generate import driver, executors, generate, plan
+from navrep_data.generate.compiling import Compiling
 from navrep_data.io import json_bytes
 from navrep_data.shards import DatasetFolder, Manifest, verify, writer_lock
 
@@ -450,3 +453,21 @@ def test_worlds_without_polygons_feed_datasets(tmp_path, env):
     with pytest.raises(ConfigError, match="world='empty', obstacles=3 cannot be combined"):
         generate(env=env, n=1, out=tmp_path / "e", obstacles=3)
     assert not (tmp_path / "e").exists()
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason="kernels are plain Python here")
+def test_compiling_is_told_and_counted_once_it_happens(capsys):
+    said = []
+    number = numba.njit(lambda x: x + 1)
+    with Compiling(said.append, progress=True):
+        assert number(1) == 2
+        assert number(1.0) == 2.0
+    assert said == ["Compiling kernels for this machine (once, about half a minute)"]
+    assert re.search(r"Compiling: \d kernels", capsys.readouterr().err)
+    with Compiling(said.append, progress=True):
+        assert number(1) == 2
+    with Compiling(said.append, progress=False):
+        assert number(2j) == 1 + 2j
+    assert len(said) == 2
+    assert capsys.readouterr().err == ""
+    assert gc.isenabled()
