@@ -8,13 +8,11 @@ from pathlib import Path
 
 import pytest
 import typer
+from warm_process import WarmProcess
 
 import navrep_data
 from navrep_data.cli.main import app
 from navrep_data.testing import tiny_dataset
-
-sys.path.insert(0, str(Path(__file__).parent))
-from warm_process import WarmProcess
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"

@@ -13,9 +13,13 @@ import tempfile
 import traceback
 import types
 import warnings
+from functools import cache
 from pathlib import Path
 
-HEAVY = ("torch.utils.data", "numba", "h5py", "gymnasium", "stable_baselines3", "huggingface_hub", "matplotlib.pyplot")
+HEAVY = (
+    "torch.utils.data", "numba", "h5py", "gymnasium", "stable_baselines3", "huggingface_hub", "matplotlib.pyplot",
+    "typer", "rich.console", "scipy.optimize", "PIL.Image", "yaml", "safetensors.torch", "tqdm",
+)  # fmt: skip
 
 
 class WarmProcess:
@@ -39,10 +43,18 @@ class WarmProcess:
         self.process.wait()
         self.process.stdout.close()
 
-    def run(self, arguments, cwd):
-        """Run ``navrep-data ARGUMENTS`` or, where the first one is ``-c``, a program."""
+    def run(self, arguments, cwd=None, env=None):
+        """Run ``navrep-data ARGUMENTS`` or, where the first one is ``-c``, a program.
+
+        `env` replaces the environment; what is read at import (of huggingface_hub, say) has been read by then.
+        """
         with tempfile.TemporaryDirectory() as folder:
-            request = {"arguments": [str(a) for a in arguments], "cwd": str(cwd), "folder": folder}
+            request = {
+                "arguments": [str(a) for a in arguments],
+                "cwd": str(cwd or Path.cwd()),
+                "env": env,
+                "folder": folder,
+            }
             self.process.stdin.write(json.dumps(request) + "\n")
             self.process.stdin.flush()
             code = int(self.process.stdout.readline())
@@ -50,9 +62,18 @@ class WarmProcess:
         return subprocess.CompletedProcess(arguments, code, out, err)
 
 
+@cache
+def shared():
+    """Return one for all tests of this process, for its whole life."""
+    return WarmProcess().__enter__()  # it ends when its input does
+
+
 def _become(request):
     """In a copy: be a new process that runs the request. Returns its exit status."""
     os.chdir(request["cwd"])
+    if request["env"] is not None:
+        os.environ.clear()
+        os.environ.update(request["env"])
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     for number, name in ((1, "out"), (2, "err")):
         os.dup2(os.open(Path(request["folder"], name), os.O_WRONLY | os.O_CREAT), number)

@@ -6,14 +6,11 @@ import subprocess
 import sys
 
 import pytest
+import warm_process
 
 
 def run(*arguments, cwd=None):
-    return subprocess.run(
-        [sys.executable, "-m", "navrep_data", "benchmark", *map(str, arguments)],
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=cwd,
-        env={**os.environ, "COLUMNS": "200"},
-    )  # fmt: skip
+    return warm_process.shared().run(["benchmark", *arguments], cwd, {**os.environ, "COLUMNS": "200"})
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: real processes, closed stdin."""
+"""The command line as a user meets it: processes of their own, closed stdin."""
 
 import json
 import os
@@ -6,16 +6,13 @@ import subprocess
 import sys
 
 import pytest
+import warm_process
 
 FLAGS = ["--humans", "3", "--obstacles", "2", "--length", "20", "--workers", "1"]
 
 
 def run(*arguments, cwd=None):
-    return subprocess.run(
-        [sys.executable, "-m", "navrep_data", *map(str, arguments)],
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=cwd,
-        env={**os.environ, "COLUMNS": "200"},
-    )  # fmt: skip
+    return warm_process.shared().run(arguments, cwd, {**os.environ, "COLUMNS": "200"})
 
 
 @pytest.fixture(scope="module")

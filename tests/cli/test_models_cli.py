@@ -1,13 +1,12 @@
-"""``navrep-data models`` as a user meets it: real processes, closed stdin."""
+"""``navrep-data models`` as a user meets it: processes of their own, closed stdin."""
 
 import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 
 import pytest
+import warm_process
 
 pytestmark = pytest.mark.slow  # seconds each; `make test` runs them
 
@@ -22,11 +21,7 @@ def run(tmp_path):
     def call(*arguments, cwd=None, **variables):
         environment = {k: v for k, v in os.environ.items() if not k.startswith(("NAVREP_RELEASED", "HF_"))}
         environment |= {"COLUMNS": "200", "NAVREP_DATA_HOME": str(tmp_path / "home"), "NAVREP_DATA_OFFLINE": "1"}
-        return subprocess.run(
-            [sys.executable, "-m", "navrep_data", "models", *map(str, arguments)],
-            stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=cwd,
-            env={**environment, **variables},
-        )  # fmt: skip
+        return warm_process.shared().run(["models", *arguments], cwd, {**environment, **variables})
 
     return call
 
