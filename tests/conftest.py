@@ -8,15 +8,14 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent / "no_network"))
 
 import loopback_only
+from recorded import AUTHORS
 
 loopback_only.install()
 
-SHARED = Path(__file__).resolve().parents[1].parent / "shared"
-
 
 @pytest.fixture(scope="session")
-def shared() -> Path:
-    """The folder of reference material beside the checkout."""
-    if not (SHARED / "reference").is_dir():
-        pytest.skip("needs ../shared (reference material, not part of the repository)")
-    return SHARED
+def released() -> Path:
+    """The folder with the NavRep authors' weights, which are not part of the repository."""
+    if not (AUTHORS / "models" / "gym").is_dir():
+        pytest.skip("needs the authors' weights: let NAVREP_RELEASED_DIR name a checkout of their repository")
+    return AUTHORS

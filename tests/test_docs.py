@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import typer
+from recorded import AUTHORS
 from warm_process import WarmProcess
 
 import navrep_data
@@ -27,7 +28,6 @@ TEXTS = [
 SETUP = ("pip ", "make ")
 # These pages make their own data; the others find a small data/soadrl.
 FROM_SCRATCH = ("README", "tour")
-RELEASED = ROOT.parent / "shared" / "released"
 
 
 def blocks(page, kinds=("bash", "python")):
@@ -71,14 +71,14 @@ def hub():
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=lambda page: page.stem)
 def test_code_blocks_run(page, tmp_path, hub):
     env = {**hub, "HF_HOME": str(tmp_path / "hf")}
-    if RELEASED.is_dir():
-        env["NAVREP_RELEASED_DIR"] = str(RELEASED)
+    if AUTHORS.is_dir():
+        env["NAVREP_RELEASED_DIR"] = str(AUTHORS)
     if page.stem not in FROM_SCRATCH:
         tiny_dataset(tmp_path / "data" / "soadrl", n=12, length=200)
     ran = 0
     with WarmProcess(env) as warm:
         for kind, code in blocks(page):
-            if ".released" in code and not RELEASED.is_dir():
+            if ".released" in code and not AUTHORS.is_dir():
                 continue  # the authors' files are not part of the repository
             named = re.match(r"# (\w+\.py)\n", code)
             if named:  # a file to save, for the commands that follow

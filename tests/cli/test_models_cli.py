@@ -3,10 +3,11 @@
 import json
 import os
 import re
-import shutil
 
 import pytest
 import warm_process
+from recorded import golden as recorded_golden
+from recorded import write_golden
 
 pytestmark = pytest.mark.slow  # seconds each; `make test` runs them
 
@@ -48,8 +49,8 @@ def test_list(run):
     assert " rings " in run("modular_rings.v1").stdout
 
 
-def test_list_tells_what_is_here(run, shared):
-    found = json.loads(run("--json", NAVREP_RELEASED_DIR=str(shared / "released")).stdout)
+def test_list_tells_what_is_here(run, released):
+    found = json.loads(run("--json", NAVREP_RELEASED_DIR=str(released)).stdout)
     theirs = [r for r in found if r["tag"] != "v1"]
     assert sum(r["here"] for r in theirs if r["kind"] == "policy") == 19
     assert all(r["here"] for r in found if r["tag"] == "v1")
@@ -84,15 +85,15 @@ def test_show(run):
     assert json.loads(done.stdout)["name"] == "modular_1d_h.20200920"
 
 
-def test_fetch_offline(run, shared, tmp_path):
+def test_fetch_offline(run, released, tmp_path):
     done = run("fetch", E2E)
     assert done.returncode == 2
     assert done.stderr.startswith(f"Error: {E2E} needs models/gym/{E2E_FILE} (sha256 ")
     assert str(tmp_path / "home") in done.stderr
     assert done.stderr.count("\n") == 1
-    done = run("fetch", E2E, "--from", shared / "released", "--json")
+    done = run("fetch", E2E, "--from", released, "--json")
     assert list(json.loads(done.stdout)["files"]) == [f"models/gym/{E2E_FILE}"]
-    done = run("fetch", "transformer_rings_z.released", "--from", shared / "released")
+    done = run("fetch", "transformer_rings_z.released", "--from", released)
     assert done.returncode == 1
     assert "navreptraingpt (git blob 5d4e82c51a129a8aabc45bef0a51649b9eecc56a)" in done.stderr
 
@@ -106,8 +107,8 @@ def test_name_or_all(run, verb):
 
 
 @pytest.mark.slow
-def test_verify_all(run, shared):
-    done = run("verify", "--all", "--from", shared / "released", "--golden", shared / "golden")
+def test_verify_all(run, released, tmp_path):
+    done = run("verify", "--all", "--from", released, "--golden", write_golden(tmp_path / "golden"))
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
     assert sum(line.startswith("ok ") and ".v1" not in line for line in lines) == 56
@@ -138,13 +139,14 @@ def test_verify_all_without_the_authors_files(run):
     assert any("13 right, 61 missing, 0 wrong; 76 of 76 golden outputs within tolerance" in line for line in lines)
 
 
-def test_verify_one(run, shared, tmp_path):
-    done = run("verify", E2E, "--from", shared / "released", "--json")
+def test_verify_one(run, released, tmp_path):
+    done = run("verify", E2E, "--from", released, "--json")
     found = json.loads(done.stdout)
     assert done.returncode == 0
     assert found["ok"] is True
     assert (found["right"], found["missing"], found["wrong"], found["cannot_run"]) == (1, 0, 0, [])
-    done = run("verify", "modular_1d_v", "--from", shared / "released", "--golden", shared / "golden", "--json")
+    golden = write_golden(tmp_path / "golden")
+    done = run("verify", "modular_1d_v", "--from", released, "--golden", golden, "--json")
     outputs = json.loads(done.stdout)["checks"][0]["comparisons"]
     assert {c["output"] for c in outputs} == {"mu", "logvar", "decode_mu", "decode_z", "weights"}
     assert all(0 < c["error"] < c["tolerance"] for c in outputs if c["original"])
@@ -152,13 +154,13 @@ def test_verify_one(run, shared, tmp_path):
 
 
 @pytest.mark.slow
-def test_verify_finds_flipped_bytes_and_changed_golden_outputs(run, shared, tmp_path):
+def test_verify_finds_flipped_bytes_and_changed_golden_outputs(run, released, tmp_path):
     import numpy as np
 
     folder = tmp_path / "mine"
     folder.mkdir()
     name = "e2e1dnavreptrainenv_2020_09_01__11_44_49_PPO_E2E1D_VCARCH_C64_ckpt.zip"
-    data = bytearray((shared / "released" / "models" / "gym" / name).read_bytes())
+    data = bytearray((released / "models" / "gym" / name).read_bytes())
     data[5000] ^= 1
     (folder / name).write_bytes(data)
     done = run("verify", "e2e_1d.20200901", "--from", folder)
@@ -168,20 +170,19 @@ def test_verify_finds_flipped_bytes_and_changed_golden_outputs(run, shared, tmp_
 
     golden = tmp_path / "golden"
     golden.mkdir()
-    source = shared / "golden" / f"E2E_{name.removesuffix('.zip')}.npz"
-    arrays = dict(np.load(source))
-    arrays["action_mean"] = arrays["action_mean"] * 1.001
-    np.savez(golden / source.name, **arrays)
-    done = run("verify", "e2e_1d.20200901", "--from", shared / "released", "--golden", golden)
+    stem = f"E2E_{name.removesuffix('.zip')}"
+    arrays = recorded_golden(stem)
+    np.savez(golden / f"{stem}.npz", **{**arrays, "action_mean": arrays["action_mean"] * 1.001})
+    done = run("verify", "e2e_1d.20200901", "--from", released, "--golden", golden)
     assert done.returncode == 1
     assert "action_mean differs by" in done.stdout
-    shutil.copy(source, golden)
-    assert run("verify", "e2e_1d.20200901", "--from", shared / "released", "--golden", golden).returncode == 0
+    np.savez(golden / f"{stem}.npz", **arrays)
+    assert run("verify", "e2e_1d.20200901", "--from", released, "--golden", golden).returncode == 0
 
 
 @pytest.mark.slow
-def test_convert(run, shared, tmp_path):
-    file = shared / "released" / "models" / "gym" / E2E_FILE
+def test_convert(run, released, tmp_path):
+    file = released / "models" / "gym" / E2E_FILE
     done = run("convert", file, "--out", tmp_path / "e2e.safetensors", "--json")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["file"] == str(file)

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from recorded import write_original_npz
 
 from navrep_data.datasets import SequenceDataset, import_npz
 from navrep_data.datasets.npz import FILE_SUFFIX, MAX_ROWS
@@ -22,8 +23,6 @@ from navrep_data.errors import (
 )
 from navrep_data.schema import Event
 from navrep_data.shards import DatasetFolder, verify
-
-ORIGINAL = Path(__file__).resolve().parents[2] / "../shared/reference/original_npz"
 
 
 def sequence(n=60, ends=(9, 29, 30, 45), unplayed=(30, 50), goals=(9,), crashes=(45,), seed=0):
@@ -162,11 +161,11 @@ def test_windows_of_an_import_hold_no_nan(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not ORIGINAL.is_dir(), reason="needs ../shared/reference/original_npz")
 def test_the_original_files(tmp_path):
-    files = sorted(ORIGINAL.glob("*.npz"))
+    original = write_original_npz(tmp_path / "original")
+    files = sorted(original.glob("*.npz"))
     assert len(files) == 2
-    import_npz(ORIGINAL, tmp_path / "out")
+    import_npz(original, tmp_path / "out")
     folder = DatasetFolder(tmp_path / "out")
     assert folder.manifest.rows == 2000
     stuck = 0

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_import_npz import ORIGINAL, sequence, write
+from recorded import write_original_npz
+from test_import_npz import sequence, write
 
 from navrep_data.datasets import import_npz
 from navrep_data.datasets.tools import export, filter, original_arrays
@@ -60,11 +61,11 @@ def test_imports_go_out_as_they_came(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not ORIGINAL.is_dir(), reason="needs ../shared/reference/original_npz")
 def test_the_original_files_go_out_as_they_came(tmp_path):
-    import_npz(ORIGINAL, tmp_path / "d")
+    original = write_original_npz(tmp_path / "original")
+    import_npz(original, tmp_path / "d")
     export(tmp_path / "d", tmp_path / "out", format="npz")
-    check_equal(tmp_path / "out", ORIGINAL)
+    check_equal(tmp_path / "out", original)
 
 
 def test_an_end_is_not_lost_with_the_frame_that_told_of_it(tmp_path):

@@ -1,12 +1,11 @@
 """The single environment: checkers, episodes and seeds, infos, endings, errors."""
 
-import json
-
 import gymnasium
 import numpy as np
 import pytest
 from env_cases import CASES, HAS_MAPS, NUMBERED, PHYSICS, STREAMED, make, same
 from gymnasium.utils.env_checker import check_env
+from recorded import reference
 
 from navrep_data.envs import NavRepEnv, goal_policy
 from navrep_data.errors import ConfigError, UnknownNameError
@@ -51,8 +50,8 @@ def test_episodes_start_where_asked_and_wrap_at_500():
     assert [env.reset()[1]["seed"] for _ in range(2)] == [49, 0]
 
 
-def test_original_episodes_are_the_original_softwares(shared):
-    episodes = json.loads((shared / "reference" / "test_env_reference.json").read_text())["episodes"]
+def test_original_episodes_are_the_original_softwares():
+    episodes = reference("test_env_reference.json")["episodes"]
     env = make("navrep-test", physics="original", episode=0)
     assert len(episodes) == 5
     for k, episode in enumerate(episodes):

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from recorded import reference
 
 from navrep_data.evaluate.metrics import (
     METRICS,
@@ -97,11 +98,8 @@ def test_wilson_of_nothing_knows_nothing():
     assert wilson(0, 0) == (0.0, 1.0)
 
 
-def test_wilson_equals_the_reference(shared):
-    import json
-
-    scores = json.loads((shared / "reference" / "original_scores.json").read_text())
-    for run in scores["navreptrain_test"].values():
+def test_wilson_equals_the_reference():
+    for run in reference("original_scores.json")["navreptrain_test"].values():
         assert wilson(run["outcome"].count("S"), run["n"]) == pytest.approx(run["wilson95_success"])
 
 

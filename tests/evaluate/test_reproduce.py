@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from recorded import reference
 
 from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError
 from navrep_data.evaluate.metrics import METRICS, Contacts
@@ -78,8 +79,8 @@ def test_results_are_found_at_any_depth_and_the_longer_counts(measured):
     assert scores(list(found.values()))["e2e_1d"]["released"]["all"]["episodes"] == 81, "noisy runs are not drawn"
 
 
-def test_the_authors_numbers_are_those_of_the_reference(shared):
-    theirs = json.loads((shared / "reference" / "original_scores.json").read_text())["authors_figure_27_scenarios"]
+def test_the_authors_numbers_are_those_of_the_reference():
+    theirs = reference("original_scores.json")["authors_figure_27_scenarios"]
     assert {part: authors()[part] for part in PARTS} == {part: theirs[part] for part in PARTS}
     assert "guldenring_test.png" in authors()["source"]
     assert "Not measured by navrep-data" in authors()["what"]

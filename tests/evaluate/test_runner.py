@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from recorded import reference
 
 from navrep_data.errors import (
     ConfigError,
@@ -87,9 +88,9 @@ def test_metrics_and_events_are_those_of_a_plain_loop(physics):
         assert episode.trajectory[-1] == pytest.approx(100 * np.array(path[-1]), abs=0.51)
 
 
-def test_the_goal_rule_gives_the_originals_control(shared):
+def test_the_goal_rule_gives_the_originals_control():
     """15.0 % on the original's 200 seeded test episodes (original_scores.json, note)."""
-    note = json.loads((shared / "reference" / "original_scores.json").read_text())["note"]
+    note = reference("original_scores.json")["note"]
     assert "straight to the goal 15.0 % (test env)" in note
     found = played("goal", range(200))
     assert sum(e.event == Event.GOAL for e in found.values()) == 30

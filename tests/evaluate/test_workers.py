@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from recorded import reference
 
 from navrep_data.evaluate import benchmark, wilson
 
@@ -16,16 +17,8 @@ pytestmark = pytest.mark.slow  # seconds to a minute each; `make test` runs them
 
 
 @pytest.fixture
-def released(shared):
-    folder = shared / "released"
-    if not folder.is_dir():
-        pytest.skip("needs ../shared/released (the authors' files)")
-    return folder
-
-
-@pytest.fixture
-def scores(shared):
-    return json.loads((shared / "reference" / "original_scores.json").read_text())
+def scores():
+    return reference("original_scores.json")
 
 
 @pytest.mark.parametrize("policy", ["dwa", "pilots_for_tests:Counting"])

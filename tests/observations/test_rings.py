@@ -1,25 +1,20 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+import recorded
 from numba import config
 
 from navrep_data import observations as obs
 from navrep_data.errors import ArrayError, ConfigError
 from navrep_data.observations.rings import first_rays
 
-GOLDEN = Path(__file__).resolve().parents[2].parent / "shared" / "golden" / "rings.npz"
 PURE_PYTHON = bool(config.DISABLE_JIT)
 
 
 @pytest.fixture(scope="module")
 def golden():
-    if not GOLDEN.exists():
-        pytest.skip("needs ../shared (golden/rings.npz)")
-    with np.load(GOLDEN) as data:
-        return dict(data)
+    return recorded.golden("rings")
 
 
 def slow_rings(scan):

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import math
 import sys
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numba import config
+from recorded import reference
 
 from navrep_data.errors import MissingExtraError
 from navrep_data.schema import SensorContract
@@ -235,9 +235,9 @@ def test_outlines_as_polygons_give_the_same_scan():
         assert different.sum() == 0
 
 
-def test_scans_of_the_original_test_environment(shared):
+def test_scans_of_the_original_test_environment():
     """Recorded rays of the released simulator: its marching overlooks solid cells of which a ray cuts only a corner."""
-    runs = json.loads((shared / "reference" / "ian_env_reference.json").read_text())["runs"]
+    runs = reference("ian_env_reference.json")["runs"]
     equal = total = 0
     overlooked = []
     for run in runs[1:2] if PURE_PYTHON else runs:

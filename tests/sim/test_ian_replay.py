@@ -8,17 +8,15 @@ vector of rounding errors, and rays that pass a corner of a cell, which the orig
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from recorded import reference
 
 from navrep_data.errors import MissingExtraError
 from navrep_data.sim import Simulator, make_config, map_names
 
-REFERENCE = Path(__file__).resolve().parents[2] / "../shared/reference/ian_env_reference.json"
 RUNS = 6
 MAX_VELOCITY = np.array([0.55, 0.55, 2.0])
 # the reference has five digits of humans and six of the robot
@@ -29,13 +27,11 @@ RANGE_TOLERANCE = 1e-3
 
 @pytest.fixture(scope="module")
 def runs() -> list[dict[str, Any]]:
-    if not REFERENCE.is_file():
-        pytest.skip("the reference folder is not here")
     try:
         map_names()
     except MissingExtraError as error:
         pytest.skip(str(error))
-    found: list[dict[str, Any]] = json.loads(REFERENCE.read_text(encoding="utf-8"))["runs"]
+    found: list[dict[str, Any]] = reference("ian_env_reference.json")["runs"]
     assert len(found) == RUNS
     return found
 
@@ -84,10 +80,7 @@ def test_run_replays(runs: list[dict[str, Any]], k: int) -> None:
 
 def test_start_headings_are_those_of_the_original_scores() -> None:
     """Episode r of scenario i: seed 27 r + i, and the heading is the first number drawn."""
-    scores = REFERENCE.with_name("original_scores.json")
-    if not scores.is_file():
-        pytest.skip("the reference folder is not here")
-    rows = next(iter(json.loads(scores.read_text(encoding="utf-8"))["ian"].values()))["rows"]
+    rows = next(iter(reference("original_scores.json")["ian"].values()))["rows"]
     config = make_config("ian", physics="original")
     rows = [row for row in rows if row["scenario"].startswith(("rl", "irosasl3"))]
     simulator = Simulator(config, len(rows))

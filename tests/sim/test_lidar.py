@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numba import config
+from recorded import DATA
 
 from navrep_data.errors import ArrayError, ConfigError
 from navrep_data.schema import SensorContract
@@ -16,7 +17,7 @@ from navrep_data.sim.lidar import polygon_edges, ray_directions, scan_polygons
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from oracles_lidar import brute_force, wrong_rays
 
-GOLDEN = Path(__file__).resolve().parents[2].parent / "shared" / "golden" / "test_env_traces.npz"
+GOLDEN = DATA / "golden" / "test_env_traces.npz"
 PURE_PYTHON = bool(config.DISABLE_JIT)
 WORLDS = 6 if PURE_PYTHON else 150
 NO_CIRCLES = np.empty((0, 3))
@@ -359,8 +360,6 @@ def golden_scenes(data, episodes):
 
 
 def test_scans_of_the_original_environment():
-    if not GOLDEN.exists():
-        pytest.skip("needs ../shared (golden/test_env_traces.npz)")
     different, corrected = [], 0
     with np.load(GOLDEN) as data:
         for episode, step, polygons, legs, pose, expected in golden_scenes(data, (6,) if PURE_PYTHON else range(10)):

@@ -1,18 +1,14 @@
 """The original's seeded test episodes, replayed in original physics along stored actions."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
+from recorded import DATA, reference
 
 from navrep_data.schema import Event
 from navrep_data.sim import Simulator, make_config, numpy_seed
 from navrep_data.sim import _layout as lay
 
-GOLDEN = Path(__file__).resolve().parents[1] / "golden"
-TRACES = Path(__file__).resolve().parents[2] / "../shared/golden/test_env_traces.npz"
-REFERENCE = json.loads((GOLDEN / "test_env_reference.json").read_text())["episodes"]
+REFERENCE = reference("test_env_reference.json")["episodes"]
 EPISODES = tuple(range(10))
 TIMEOUT, GOAL, COLLISION, _, DANGER, NOTHING = range(6)
 EVENTS = {
@@ -99,16 +95,10 @@ def check_replay(path, stride):
 
 
 def test_stored_episodes_replay():
-    wrong, rays = check_replay(GOLDEN / "test_env_episodes.npz", 3)
-    assert rays > 1000
-    assert len(wrong) <= 1  # episode 6, step 2, ray 1050 grazes a leg at 0.998 of its radius
-
-
-def test_full_traces_replay():
-    if not TRACES.is_file():
-        pytest.skip("needs ../shared/golden/test_env_traces.npz (reference material, not part of the repository)")
-    wrong, _ = check_replay(TRACES, 1)
-    assert len(wrong) <= 2  # and step 1, ray 1079: a leg between the last ray and ray 0
+    wrong, rays = check_replay(DATA / "golden" / "test_env_traces.npz", 1)
+    assert rays > 3000
+    # episode 6: at step 2 ray 1050 grazes a leg at 0.998 of its radius; at step 1 a leg is between ray 1079 and ray 0
+    assert len(wrong) <= 2
 
 
 @pytest.fixture(scope="module")

@@ -10,19 +10,18 @@ As a program (`python tests/sim/test_original_statistics.py [sequences]`) this p
 the numbers of docs/differences.md.
 """
 
-import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import reference
 from scipy.stats import chi2_contingency
 
 from navrep_data.schema import Event
 from navrep_data.sim import RolloutSettings, ScriptedPolicy, ScriptedRollout, make_config
 from navrep_data.sim import _layout as lay
 
-REFERENCE = json.loads((Path(__file__).resolve().parents[1] / "golden" / "original_dataset_stats.json").read_text())
+REFERENCE = reference("original_dataset_stats.json")
 ROWS = 1000
 QUANTILES = {"p01": 0.01, "p05": 0.05, "p25": 0.25, "p50": 0.5, "p75": 0.75, "p95": 0.95, "p99": 0.99}
 # About 100 correlated statistics: 4 standard errors come by chance in 1 of 160 runs, and ours is the same run always.

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
+from recorded import reference
 
 from navrep_data.errors import ConfigError, UnknownNameError
 from navrep_data.sim import MAP_GROUPS, get_scenario, make_config, scenario_names
 
-REFERENCE = Path(__file__).resolve().parents[2] / "../shared/reference/scenarios.json"
-
 
 def test_scenarios_are_the_originals() -> None:
-    if not REFERENCE.is_file():
-        pytest.skip("the reference folder is not here")
-    wanted = json.loads(REFERENCE.read_text(encoding="utf-8"))["scenarios"]
+    wanted = reference("scenarios.json")["scenarios"]
     assert scenario_names() == [entry["name"] for entry in wanted]
     for entry in wanted:
         scenario = get_scenario(entry["name"])

@@ -456,8 +456,8 @@ def test_refit_refuses_what_is_no_policy(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_released_policy_is_continued(shared, few_episodes, tmp_path, monkeypatch):
-    monkeypatch.setenv("NAVREP_RELEASED_DIR", str(shared / "released"))
+def test_a_released_policy_is_continued(released, few_episodes, tmp_path, monkeypatch):
+    monkeypatch.setenv("NAVREP_RELEASED_DIR", str(released))
     init = zoo.load("transformer_1d_z.released")
     model = zoo.load("transformer_1d.released")
     recipe = default_controller_recipe("z", "1d").replace(**{**SMALL, "steps": 64, "lr": 1e-9})

@@ -189,18 +189,17 @@ def test_require_here_names_the_missing_part(tmp_path):
         require_here(registry.find("transformer_1d_z.released"), Source.of(tmp_path))
 
 
-def test_fetch_brings_policy_and_parts(shared, home):
-    folder = shared / "released"
-    files = zoo.fetch("transformer_1d_z.released", folder)
+def test_fetch_brings_policy_and_parts(released, home):
+    files = zoo.fetch("transformer_1d_z.released", released)
     assert files[0].name == "navreptraingpt1d"
     assert len(files) == 2
-    assert all(Path(f).is_relative_to(folder) for f in files)
-    wrong = [r.name for r in registry.records().values() for f in r.files if locate(f, Source(folder))[1]]
+    assert all(Path(f).is_relative_to(released) for f in files)
+    wrong = [r.name for r in registry.records().values() for f in r.files if locate(f, Source(released))[1]]
     assert wrong == []
 
 
-def test_fetch_over_http_then_load_offline(shared, home, monkeypatch):
-    source = shared / "released" / "models"
+def test_fetch_over_http_then_load_offline(released, home, monkeypatch):
+    source = released / "models"
     names = ["W/navreptraingpt1d", "gym/navreptrainencodedenv_2020_10_15__09_18_59_PPO_GPT1D_V_ONLY_V64M64_ckpt.zip"]
     files = {f"/models/{name}": (source / name).read_bytes() for name in names}
     with serving(Site(files=files, cut_every=400_000)) as site:

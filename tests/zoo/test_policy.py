@@ -8,6 +8,7 @@ import numpy as np
 import oracles_models as oracles
 import pytest
 import torch
+from recorded import golden
 
 from navrep_data.errors import ArrayError, CheckpointError, ConfigError, PolicyError
 from navrep_data.models import Controller, ControllerConfig, ModularWorldModel, VAEConfig, checkpoint
@@ -32,32 +33,31 @@ def one_thread():
     torch.set_num_threads(before)
 
 
-def golden(shared, name):
-    with np.load(shared / "golden" / f"{name}.npz") as npz:
-        return {k: npz[k] for k in npz.files}
+@pytest.fixture(scope="module")
+def made_up(tmp_path_factory):
+    """M, and the modular world model for rings, of made-up weights."""
+    tmp = tmp_path_factory.mktemp("made-up")
+    m = oracles.write_integers(oracles.synthetic_integers(golden("synthetic_M"), "memory"), tmp / "m.json")
+    v = oracles.write_integers(oracles.synthetic_integers(golden("synthetic_V_rings"), "vae_rings"), tmp / "v.json")
+    memory = load_tf_json(m, "memory")
+    return memory, ModularWorldModel.of(load_tf_json(v, "vae_rings"), memory)
 
 
 @pytest.fixture(scope="module")
-def world_models(shared, tmp_path_factory):
+def world_models(made_up, released):
     """Encoder and memory of each ``encoder_*`` golden file."""
-    models = shared / "released" / "models"
-    if not models.is_dir():
-        pytest.skip("needs ../shared/released (the authors' files)")
-    tmp = tmp_path_factory.mktemp("made-up")
-    m = oracles.write_integers(oracles.synthetic_integers(golden(shared, "synthetic_M"), "memory"), tmp / "m.json")
-    v = oracles.write_integers(
-        oracles.synthetic_integers(golden(shared, "synthetic_V_rings"), "vae_rings"), tmp / "v.json"
-    )
-    memory = load_tf_json(m, "memory")
+    models = released / "models"
+    memory, rings = made_up
     return {
         "encoder_GPT1D_det": load_torch_world_model(models / "W" / "navreptraingpt1d"),
         "encoder_VAE1DLSTM_det": load_torch_world_model(models / "W" / "navreptrainvae1dlstm"),
         "encoder_VAE1D_LSTM": ModularWorldModel.of(load_tf_json(models / "V" / "navreptrainvae1d.json", None), memory),
-        "encoder_VAE_LSTM": ModularWorldModel.of(load_tf_json(v, "vae_rings"), memory),
+        "encoder_VAE_LSTM": rings,
     }
 
 
-ENCODERS = ["encoder_GPT1D_det", "encoder_VAE1DLSTM_det", "encoder_VAE1D_LSTM", "encoder_VAE_LSTM"]
+MADE_UP = "encoder_VAE_LSTM"
+ENCODERS = ["encoder_GPT1D_det", "encoder_VAE1DLSTM_det", "encoder_VAE1D_LSTM", MADE_UP]
 
 
 def policy_of(world_model, features, seed=0, **options):
@@ -68,10 +68,18 @@ def policy_of(world_model, features, seed=0, **options):
 
 
 @pytest.mark.parametrize("features", ENCODINGS)
-@pytest.mark.parametrize("name", ENCODERS)
-def test_from_raw_scans_to_controller_inputs(shared, world_models, name, features):
-    g = golden(shared, name)
-    policy = policy_of(world_models[name], features)
+@pytest.mark.parametrize("name", [name for name in ENCODERS if name != MADE_UP])
+def test_from_raw_scans_to_controller_inputs(world_models, name, features):
+    check_inputs(policy_of(world_models[name], features), name, features)
+
+
+@pytest.mark.parametrize("features", ENCODINGS)
+def test_from_raw_scans_to_controller_inputs_with_made_up_weights(made_up, features):
+    check_inputs(policy_of(made_up[1], features), MADE_UP, features)
+
+
+def check_inputs(policy, name, features):
+    g = golden(name)
     policy.reset(batch_size=2)
     for t in range(40):
         policy.observe(np.stack([g[f"seq{k}_actions"][t] for k in (0, 1)]))
@@ -92,12 +100,12 @@ def test_from_raw_scans_to_controller_inputs(shared, world_models, name, feature
         ("encoder_VAE1D_LSTM", "z", "2020_09_16__16_04_48_PPO_VAE1D_LSTM_V_ONLY_V32M512"),
     ],
 )
-def test_from_raw_scans_to_actions(shared, world_models, encoder, features, stem):
+def test_from_raw_scans_to_actions(released, world_models, encoder, features, stem):
     """Released encoder, memory and controller together, against what the original software did with these scans."""
-    inputs = golden(shared, encoder)
-    g = golden(shared, f"C_navreptrainencodedenv_{stem}_ckpt")
+    inputs = golden(encoder)
+    g = golden(f"C_navreptrainencodedenv_{stem}_ckpt")
     model = world_models[encoder]
-    gym = shared / "released" / "models" / "gym"
+    gym = released / "models" / "gym"
     network = load_controller_zip(gym / f"navreptrainencodedenv_{stem}_ckpt.zip")
     policy = Policy(network, features, "1d", None, model, name=stem)
     for k in (0, 1):
@@ -301,20 +309,20 @@ def test_parts_that_do_not_belong_together_are_refused(world_models):
         Policy(Controller(ControllerConfig(69)), "z", "1d", gpt.vae, dtype="float16")
 
 
-def test_a_controller_without_eyes_still_controls(shared, world_models):
+def test_a_controller_without_eyes_still_controls(released):
     name = "navreptrainencodedenv_2020_08_26__15_48_33_PPO_ckpt"
     record = {"name": "x", "kind": "controller", "format": "sb2-zip", "features": "z", "lidar": None, "sensor": None}
-    path = shared / "released" / "models" / "gym" / f"{name}.zip"
+    path = released / "models" / "gym" / f"{name}.zip"
     policy = build(record, {"a": path}, {})
-    g = golden(shared, f"C_{name}")
+    g = golden(f"C_{name}")
     mean, _ = policy.controller(g["obs"])
     np.testing.assert_allclose(mean, g["action_mean"], atol=1e-5 * np.abs(g["action_mean"]).max())
     with pytest.raises(PolicyError, match="its encoder is not known"):
         policy.act(*(x[0] for x in scenes(1, 1)))
 
 
-def test_files_that_are_mixed_up_are_refused(shared, world_models):
-    models = shared / "released" / "models"
+def test_files_that_are_mixed_up_are_refused(released):
+    models = released / "models"
     record = {"name": "x", "kind": "world_model", "format": None, "lidar": "rings", "z_size": 64, "h_size": 64}
     with pytest.raises(CheckpointError, match="x has lidar 1d, expected rings"):
         build(record, {"a": models / "W" / "navreptraingpt1d"}, {})
@@ -327,8 +335,8 @@ def test_files_that_are_mixed_up_are_refused(shared, world_models):
 # --- end to end, and in the package's own loops -------------------------------------------------------------------
 
 
-def test_end_to_end_inputs_are_metres_and_rings_as_measured(shared):
-    g = golden(shared, "rings")
+def test_end_to_end_inputs_are_metres_and_rings_as_measured():
+    g = golden("rings")
     scans = g["scans"].clip(0, 25)
     assert np.array_equal(scans, g["scans"])
     state = np.random.default_rng(0).normal(size=(len(scans), 5)).astype(np.float32)
@@ -363,11 +371,9 @@ def test_a_policy_rolls_out_sequences_reproducibly(world_models):
 
 
 @pytest.mark.slow
-def test_the_control_loop_of_the_examples_reaches_its_goal(shared):
+def test_the_control_loop_of_the_examples_reaches_its_goal(released):
     root = Path(__file__).resolve().parents[2]
-    if not (shared / "released").is_dir():
-        pytest.skip("needs ../shared/released (the authors' files)")
-    command = [sys.executable, str(root / "examples" / "control_loop.py"), "--source", str(shared / "released")]
+    command = [sys.executable, str(root / "examples" / "control_loop.py"), "--source", str(released)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.startswith("e2e_1d.")
     assert "goal after" in done.stdout

@@ -7,6 +7,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from recorded import reference
 
 from navrep_data import zoo
 from navrep_data.errors import UnknownNameError
@@ -21,8 +22,8 @@ INPUTS = {"z": lambda r: r.z_size + 5, "h": lambda r: 5 + r.h_size, "zh": lambda
 
 
 @pytest.fixture(scope="module")
-def released(shared):
-    return json.loads((shared / "reference" / "released.json").read_text())
+def released_files():
+    return reference("released.json")
 
 
 def test_sixty_one_checkpoints_and_two_pairs():
@@ -35,15 +36,15 @@ def test_sixty_one_checkpoints_and_two_pairs():
     assert kinds == {"policy": 52, "controller": 1, "world_model": 4, "vae": 2, "memory": 2}
 
 
-def test_every_released_file_has_its_record(released):
-    wanted = {f["path"]: f for f in released["files"] if f["kind"] in ("V", "M", "W", "C", "E2E")}
+def test_every_released_file_has_its_record(released_files):
+    wanted = {f["path"]: f for f in released_files["files"] if f["kind"] in ("V", "M", "W", "C", "E2E")}
     found = {f.path: (r, f) for r in THEIRS.values() for f in r.files}
     assert set(found) == set(wanted)
     for path, f in wanted.items():
         record, entry = found[path]
         assert (entry.bytes, entry.sha256, entry.git_blob_sha1) == (f["size_bytes"], f["sha256"], f["git_blob_sha1"])
-        assert record.source["commit"] == released["commit"]
-        assert record.source["repository"] == released["repo"]
+        assert record.source["commit"] == released_files["commit"]
+        assert record.source["repository"] == released_files["repo"]
         assert record.n_inputs == f["obs_dim"]
         assert record.z_size == f["z_dim"]
         if f["kind"] == "C":
