@@ -46,6 +46,10 @@ class Mixture:
         """Return the mean of each dimension's heaviest component, shape (..., Z + 2)."""
         return self.mean.gather(-1, self.logmix.argmax(-1, keepdim=True)).squeeze(-1)
 
+    def expected(self) -> Tensor:
+        """Return the mean of each dimension's mixture, shape (..., Z + 2): what a squared error is least for."""
+        return (torch.exp(self.logmix) * self.mean).sum(-1)
+
 
 class MDNRNN(nn.Module):
     """M: one LSTM layer and a linear layer that parametrises the mixture.
@@ -117,8 +121,8 @@ class ModularWorldModel(WorldModel):
 
     Notes
     -----
-    The prediction is z plus the mean of the likeliest component, since M models the *change* of z. (The original's
-    world-model error took that mean for z itself.)
+    The prediction is z plus the mean of the mixture, since M models the *change* of z. (The original's world-model
+    error took the mean of the likeliest component, for z itself.)
     """
 
     config: ModularConfig
@@ -151,7 +155,7 @@ class ModularWorldModel(WorldModel):
 
     def heads(self, z: Tensor, goal: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """Return next z and next goal [m]; see :meth:`WorldModel.heads`."""
-        change = self.memory.mixture(h).likeliest()
+        change = self.memory.mixture(h).expected()
         return z + change[..., : self.config.z_size], goal + change[..., self.config.z_size :] * RANGE_MAX
 
     def incremental(self, batch_size: int) -> ModularStream:

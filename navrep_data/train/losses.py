@@ -294,7 +294,7 @@ def memory_loss(
     nll = (each * where).sum() / n
     restart = restart_loss(mixture.restart_logit, batch["next_last"].to(h.dtype), recipe.restart_factor)
     restart = (restart * where).sum() / n
-    error = (mixture.likeliest() - change).detach()
+    error = (mixture.expected() - change).detach()
     parts = {
         "nll": nll,
         "restart": restart,

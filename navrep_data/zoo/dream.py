@@ -180,7 +180,7 @@ class DreamEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         n = self._z.shape[1] if isinstance(self.model, ModularWorldModel) else CONTEXT
         z, goal, actions = self._z[:, -n:], self._goal[:, -n:], actions[:, -n:]
         h, _ = self.model.hidden(z, goal, actions)
-        if self.temperature > 0.0 and isinstance(self.model, ModularWorldModel):
+        if isinstance(self.model, ModularWorldModel):
             return self._draw(self.model, h[:, -1:])
         next_z, next_goal = self.model.heads(z[:, -1:], goal[:, -1:], h[:, -1:])
         if self.temperature > 0.0:
@@ -191,14 +191,19 @@ class DreamEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return torch.from_numpy(self.np_random.standard_normal(shape).astype(np.float32))
 
     def _draw(self, model: ModularWorldModel, h: Tensor) -> tuple[Tensor, Tensor]:
-        """Draw a change of code and goal from the mixture."""
+        """Draw a change of code and goal from the mixture; at temperature 0 take the likeliest."""
         mixture = model.memory.mixture(h)
+        if self.temperature == 0.0:
+            return self._changed(mixture.likeliest())
         share = torch.softmax(mixture.logmix / self.temperature, dim=-1)
         uniform = torch.from_numpy(self.np_random.random((*share.shape[:-1], 1)).astype(np.float32))
         which = (share.cumsum(-1) < uniform).sum(-1, keepdim=True).clamp_max(share.shape[-1] - 1)
         mean, width = mixture.mean.gather(-1, which)[..., 0], mixture.logstd.gather(-1, which)[..., 0].exp()
         change = mean + width * self.temperature**0.5 * self._normal(tuple(mean.shape))
-        n = model.config.z_size
+        return self._changed(change)
+
+    def _changed(self, change: Tensor) -> tuple[Tensor, Tensor]:
+        n = self._z.shape[-1]
         return self._z[:, -1:] + change[..., :n], self._goal[:, -1:] + change[..., n:] * RANGE_MAX
 
     def _observe(self, velocity: NDArray[np.float32]) -> Observation:

@@ -71,6 +71,27 @@ def test_prediction_is_causal():
         assert not torch.allclose(before[:, 4:], after[:, 4:], atol=1e-4)
 
 
+def test_a_modular_model_predicts_the_mean_of_its_mixture():
+    """The mean has the least squared error of all predictions; the mean of the heaviest component does not."""
+    torch.manual_seed(4)
+    model = checkpoint.make("modular", {"lidar": "1d", "z_size": 4, "h_size": 8}).eval()
+    obs, goal, action = torch.rand(2, 5, 1080), torch.randn(2, 5, 2), torch.randn(2, 5, 3)
+    with torch.no_grad():
+        out = model(obs, goal, action)
+        mixture = model.memory.mixture(out.h)
+    weight = np.exp(mixture.logmix.numpy())
+    np.testing.assert_allclose(weight.sum(-1), 1.0, rtol=1e-5)
+    change = (weight * mixture.mean.numpy()).sum(-1)
+    np.testing.assert_allclose(out.next_z.numpy(), out.z.numpy() + change[..., :4], atol=1e-6)
+    np.testing.assert_allclose(out.next_goal.numpy(), goal.numpy() + 25.0 * change[..., 4:], atol=1e-5)
+    draws = np.random.default_rng(0)
+    which = (draws.random((4000, 1)) < np.cumsum(weight[0, 0, 0])).argmax(-1)
+    widths = np.exp(mixture.logstd.numpy()[0, 0, 0])
+    seen = mixture.mean.numpy()[0, 0, 0][which] + widths[which] * draws.standard_normal(4000)
+    likeliest = float(mixture.likeliest()[0, 0, 0])
+    assert ((seen - change[0, 0, 0]) ** 2).mean() < ((seen - likeliest) ** 2).mean()
+
+
 def test_wrong_shapes_and_settings_are_refused():
     vae = VAE(VAEConfig("1d", 32))
     with pytest.raises(ArrayError, match=r"expected \(..., 1080\)"):

@@ -72,6 +72,22 @@ def test_the_first_frame_is_the_datasets_and_reward_is_metres_towards_the_goal(d
     assert reward == pytest.approx(before - np.linalg.norm(obs["robot_state"][:2]), abs=1e-5)
 
 
+def test_without_temperature_a_modular_dream_takes_the_likeliest_change(dataset):
+    model = make("modular")
+    env = DreamEnv(model, dataset)
+    z = torch.tensor(env.reset(options={"start": 0})[1]["z"])
+    action = np.array([0.5, 0.0, 0.0], np.float32)
+    changed = torch.tensor(env.step(action)[4]["z"])
+    with torch.no_grad():
+        h, _ = model.hidden(env._z[:, :-1], env._goal[:, :-1], led_to(env))
+    torch.testing.assert_close(changed, z + model.memory.mixture(h[0, -1]).likeliest()[: len(z)])
+
+
+def led_to(env):
+    """The actions that led to the rows before the dreamed one."""
+    return torch.cat([torch.zeros(1, 1, 3), env._taken[:, :-1]], dim=1)
+
+
 @pytest.mark.parametrize(("kind", "delay"), [("transformer", 0), ("joint", 1)])
 def test_an_action_acts_at_once_where_the_model_is_fed_the_one_taken(kind, delay, dataset):
     def second_row(first):
