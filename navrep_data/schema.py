@@ -35,6 +35,11 @@ UINT16_RANGE_LIMIT = 65.0
 """Scans with a larger range_max [m] are stored as float32: 65.535 m is the end of uint16 millimetres."""
 
 
+MAX_COORDINATE = 16384.0
+"""World coordinates lie within this distance of 0 along each axis [m]: up to here float32, which stores poses and in
+which ORCA reckons, tells a millimetre."""
+
+
 class Event(enum.IntEnum):
     """Why an episode ended; 0 on every row but the last."""
 

@@ -101,6 +101,24 @@ def move_with_inertia(agents, walkers, i, limits, jerks, dt):
 
 
 @kernel
+def roll_with_inertia(agents, walkers, i, limits, jerks, dt):
+    """Move a robot that cannot slide sideways as :func:`move_with_inertia` does: one speed, along its heading."""
+    agents[i, A_X] += agents[i, A_VX] * dt
+    agents[i, A_Y] += agents[i, A_VY] * dt
+    agents[i, A_HEADING] += walkers[i, W_OMEGA] * dt
+    agents[i, A_GAIT_X] += walkers[i, W_BODY_VX] * dt
+    agents[i, A_GAIT_T] += walkers[i, W_BODY_OMEGA] * dt
+    speed = walkers[i, W_BODY_VX] + walkers[i, W_AX] * dt
+    walkers[i, W_OMEGA] += walkers[i, W_AOMEGA] * dt
+    agents[i, A_VX], agents[i, A_VY] = np.cos(agents[i, A_HEADING]) * speed, np.sin(agents[i, A_HEADING]) * speed
+    walkers[i, W_BODY_VX], walkers[i, W_BODY_VY], walkers[i, W_BODY_OMEGA] = speed, 0.0, walkers[i, W_OMEGA]
+    walkers[i, W_AX] = _accelerate(walkers[i, W_CMD_X], speed, walkers[i, W_AX], limits[0], jerks[0], dt)
+    walkers[i, W_AOMEGA] = _accelerate(
+        walkers[i, W_CMD_OMEGA], walkers[i, W_OMEGA], walkers[i, W_AOMEGA], limits[2], jerks[2], dt
+    )
+
+
+@kernel
 def move_to(agents, walkers, i, vx, vy, dt):
     """Move a human with a velocity in the map frame, its heading along it; one that stands keeps its heading."""
     before = agents[i, A_HEADING]

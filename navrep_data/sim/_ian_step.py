@@ -70,6 +70,7 @@ from navrep_data.sim._ian_motion import (
     move_with_inertia,
     put_back,
     remember,
+    roll_with_inertia,
     show,
     stop,
 )
@@ -140,7 +141,11 @@ def _move_all(agents, walkers, moves, n, map_row, rules):
         if i < robots:
             if rules[R_INERTIA] or (i > 0 and rules[R_INERTIA_REST]):
                 limits, jerks = rules[R_ACCELERATION : R_ACCELERATION + 3], rules[R_JERK : R_JERK + 3]
-                move_with_inertia(agents, walkers, i, limits, jerks, dt)
+                # in `original` physics a differential drive is a command without vy, and slides in turns
+                if rules[R_DIFFERENTIAL] and not rules[R_ORIGINAL]:
+                    roll_with_inertia(agents, walkers, i, limits, jerks, dt)
+                else:
+                    move_with_inertia(agents, walkers, i, limits, jerks, dt)
             else:
                 move_at_once(agents, walkers, i, dt)
         elif rules[R_HUMAN_POLICY] == WALK_PLANNED:

@@ -27,7 +27,9 @@ MAX_PIXELS = 1 << 26
 MAX_IMAGE_BYTES = 1 << 28
 # Formats that the decoder may try: what map_server's users write. Others of pillow's decoders stay shut.
 _FORMATS = ("PPM", "PNG")
-_GREY_MODES = ("L", "1", "P", "RGB")
+_PIXEL_MODES = ("L", "1", "P", "RGB", "LA", "RGBA")
+# Origins turned by less [rad] are not turned: over 100 m that is a centimetre.
+_TURN_TOLERANCE = 1e-4
 _REQUIRED = ("image", "resolution", "origin", "occupied_thresh", "free_thresh")
 _MODES = ("trinary", "scale")
 
@@ -49,7 +51,7 @@ class MapDescription:
     Attributes
     ----------
     yaml_path, image_path : pathlib.Path
-        Both resolved; the image lies in the folder of the YAML file or below.
+        Absolute; the YAML file names an image in its folder or below. Either may be a link into a store.
     resolution : float
         Side of a cell [m].
     origin : tuple of float
@@ -58,6 +60,8 @@ class MapDescription:
         Occupancies above and below which a cell is solid and free.
     negate : bool
         Whether dark means free.
+    mode : str
+        How map_server reads it: "trinary" or "scale".
     """
 
     yaml_path: Path
@@ -67,6 +71,7 @@ class MapDescription:
     occupied_threshold: float
     free_threshold: float
     negate: bool
+    mode: str = "trinary"
 
 
 def packaged_folder() -> Path:
@@ -89,6 +94,29 @@ def packaged_folder() -> Path:
         f"The paper's maps are not installed: they come with the package asl-pepper-2d-sim. Run {PIP_COMMAND}, "
         "or give the path of a map of your own (a YAML file or its folder)."
     )
+
+
+def is_bare(name: str) -> bool:
+    """Return whether a map is given by a bare word, which is a name first."""
+    path = Path(name)
+    return path.name == name and path.suffix not in YAML_SUFFIXES
+
+
+def map_file(name: str) -> str:
+    """Return where a map is read from that is given by name or path: paths that lead somewhere become absolute."""
+    try:
+        if is_bare(name) and (not Path(name).is_dir() or _is_packaged(name)):
+            return name
+        return str(Path(name).absolute()) if Path(name).exists() else name
+    except (OSError, ValueError):  # no working folder, or nothing that can be a path: said where it is read
+        return name
+
+
+def _is_packaged(name: str) -> bool:
+    try:
+        return (packaged_folder() / f"{name}.yaml").is_file()
+    except MissingExtraError:
+        return False
 
 
 def yaml_in_folder(folder: Path) -> Path:
@@ -153,13 +181,14 @@ def read_description(path: Path, *, packaged: bool = False) -> MapDescription:
             f"{path}: mode is {_seen(content['mode'])}, expected {' or '.join(_MODES)}: export the map in one."
         )
     return MapDescription(
-        yaml_path=path.resolve(),
+        yaml_path=path.absolute(),
         image_path=_image_path(path, content["image"], packaged),
         resolution=resolution,
         origin=_origin(path, content["origin"]),
         occupied_threshold=occupied,
         free_threshold=free,
         negate=bool(negate),
+        mode=str(content.get("mode", "trinary")),
     )
 
 
@@ -186,7 +215,7 @@ def _origin(path: Path, value: Any) -> tuple[float, float]:
     if not isinstance(value, list) or len(value) not in (2, 3):
         raise MapError(f"{path}: origin is {_seen(value)}, expected [x, y, 0]: correct it.")
     numbers = [_number(path, "origin", item) for item in value]
-    if len(numbers) == 3 and numbers[2] != 0.0:
+    if len(numbers) == 3 and abs(math.remainder(numbers[2], 2.0 * math.pi)) > _TURN_TOLERANCE:
         raise MapError(
             f"{path}: origin turns the map by {numbers[2]:g} rad, expected 0: rotate the image and set it to 0."
         )
@@ -206,22 +235,40 @@ def _image_path(path: Path, image: Any, packaged: bool) -> Path:
             f"{path}: image {image!r} is absolute or leaves the folder, expected a file beside the YAML file: "
             "copy the image there and name it."
         )
-    found = path.resolve().parent / pure
+    found = path.absolute().parent / pure
     if not found.is_file():
         raise MapError(f"{path}: image {image!r} does not exist in {path.parent}: put it there or correct the name.")
-    found = found.resolve()
-    if not found.is_relative_to(path.resolve().parent):
-        raise MapError(f"{path}: image {image!r} is a link that leaves the folder: copy the image there instead.")
     return found
 
 
-def read_grey(path: Path) -> NDArray[np.uint8]:
-    """Return a map image as (rows, columns) uint8, row 0 at the top, its size checked before it is decoded.
+def read_grey(path: Path, rule: str = "ros", mode: str = "trinary") -> tuple[NDArray[np.uint16], int]:
+    """Return the sums of a map image's channels and their number; row 0 at the top.
+
+    Its size is checked before it is decoded.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        PGM or PNG, 8 bits per channel.
+    rule : {"original", "ros"}
+        As for :func:`occupancy_of`. "ros" takes the channels of colours, as map_server their mean; "original" their
+        luma.
+    mode : {"trinary", "scale"}
+        Of map_server, which counts alpha as a channel in the first only.
+
+    Returns
+    -------
+    sums : ndarray of shape (rows, columns), uint16
+    channels : int
 
     Raises
     ------
     MapError
-        If it is no PGM or PNG image of 8-bit grey, or too large.
+        If it is no such image, or too large.
+
+    Notes
+    -----
+    image_loader.cpp of ROS 1's map_server and map_io.cpp of nav2's.
     """
     if path.stat().st_size > MAX_IMAGE_BYTES:
         raise MapError(f"{path} has {path.stat().st_size:,} bytes, expected at most {MAX_IMAGE_BYTES:,}: crop the map.")
@@ -236,9 +283,9 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
                         f"{path} is {width} x {height} pixels, expected at most {MAX_PIXELS:,}: crop it or halve "
                         "its resolution."
                     )
-                if image.mode not in _GREY_MODES:
+                if image.mode not in _PIXEL_MODES:
                     raise MapError(f"{path} has pixels of mode {image.mode}, expected 8-bit grey: convert it to that.")
-                return np.array(image.convert("L"), dtype=np.uint8)
+                return _sums(image, rule, mode)
     except MapError:
         raise
     except Image.DecompressionBombError as error:
@@ -250,19 +297,33 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
         raise MapError(f"{path} cannot be read as an image ({error}): expected a PGM or PNG of 8-bit grey.") from error
 
 
-def occupancy_of(grey: NDArray[np.uint8], rule: str, negate: bool) -> NDArray[np.float32]:
+def _sums(image: Image.Image, rule: str, mode: str) -> tuple[NDArray[np.uint16], int]:
+    alpha = "A" in image.mode or "transparency" in image.info
+    if rule == "original" or (image.mode in ("L", "1") and not alpha):
+        return np.array(image.convert("L"), dtype=np.uint16), 1
+    bands = image.convert("RGBA" if alpha else "RGB").split()
+    bands = bands if mode == "trinary" else bands[:3]
+    sums = np.zeros((image.height, image.width), np.uint16)
+    for band in bands:
+        sums += np.asarray(band)
+    return sums, len(bands)
+
+
+def occupancy_of(grey: NDArray[np.integer[Any]], rule: str, negate: bool, channels: int = 1) -> NDArray[np.float32]:
     """Return occupancies indexed [column, row from the bottom], (W, H) float32.
 
     Parameters
     ----------
-    grey : ndarray of shape (H, W), uint8
-        Row 0 at the top.
+    grey : ndarray of shape (H, W), integer
+        Grey values from 0 to 255, or sums of them over `channels`. Row 0 at the top.
     rule : {"original", "ros"}
         ``1 - v / 254`` of the original's loader, or ``(255 - v) / 255`` of map_server.
     negate : bool
         Whether white is solid; only with "ros".
+    channels : int
+        Number of channels in the sums.
     """
-    values = np.arange(256, dtype=np.float64)
+    values = np.arange(255 * channels + 1, dtype=np.float64) / channels
     if rule == "original":
         table = 1.0 - values / 254.0
     else:

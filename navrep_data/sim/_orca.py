@@ -59,6 +59,7 @@ __all__ = [
     "OA_X",
     "OA_Y",
     "OP_DT",
+    "OP_KEEP_LIMIT",
     "OP_MAX_NEIGHBORS",
     "OP_NEIGHBOR_DIST",
     "OP_TIME_HORIZON",
@@ -76,7 +77,8 @@ OP_MAX_NEIGHBORS = 1
 OP_TIME_HORIZON = 2
 OP_TIME_HORIZON_OBST = 3
 OP_DT = 4
-ORCA_PARAM_FIELDS = 5
+OP_KEEP_LIMIT = 5  # 1: the largest speed holds even where RVO2's arithmetic loses it
+ORCA_PARAM_FIELDS = 6
 
 
 @kernel(inline=True)
@@ -322,7 +324,7 @@ def orca_velocity(
         Obstacles from ``build_obstacles``, the first `n_obst` columns.
     params : ndarray of shape (ORCA_PARAM_FIELDS,), float32
         Neighbour distance [m], largest number of neighbours, time horizons for agents and obstacles [s], time
-        step [s].
+        step [s], whether the largest speed holds where RVO2's arithmetic loses it.
     work_f, work_i : ndarray
         Scratch from :func:`make_orca_work`.
 
@@ -368,6 +370,12 @@ def orca_velocity(
     failed, x, y = program2(lines, n, max_speed, pref_vx, pref_vy, False)
     if failed < n:
         x, y = program3(lines, n_obstacle, n, failed, max_speed, x, y, work_f[WORK_PROJ])
+    # Two constraints that are all but parallel meet thousands of m/s away. From a line through such a point, float32
+    # finds its way into the circle of allowed speeds only to within metres per second.
+    if params[OP_KEEP_LIMIT] > F0 and np.sqrt(x * x + y * y) > max_speed + RVO_EPSILON:
+        x, y = unit(x, y)
+        x *= max_speed
+        y *= max_speed
     return x, y
 
 

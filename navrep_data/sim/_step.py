@@ -329,6 +329,12 @@ def step_world(
         agents[r, A_HEADING] = (before + moves[r, 2] * dt) % TWO_PI
         if robots > 1 or flags[F_INERTIA]:
             go_on(r, before, agents, params, flags, commands, moves)
+        if flags[F_DIFFERENTIAL] and not original and not flags[F_INERTIA]:
+            # wheels roll along the heading that the robot has now, and that is what its odometry says
+            speed = np.cos(before) * moves[r, 0] + np.sin(before) * moves[r, 1]
+            agents[r, A_VX], agents[r, A_VY] = (
+                np.cos(agents[r, A_HEADING]) * speed, np.sin(agents[r, A_HEADING]) * speed
+            )  # fmt: skip
     if original:
         walk_original(agents, int(scalars[S_HUMANS]), moves, dt)
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from navrep_data.errors import ConfigError, did_you_mean
 from navrep_data.schema import SensorContract
 from navrep_data.sim import _layout as lay
+from navrep_data.sim._maps import map_file
 from navrep_data.sim.refusals import check_combinations
 from navrep_data.sim.scenarios import get_scenario
 
@@ -157,6 +159,19 @@ class SimConfig:
         _number("scan_noise", self.scan_noise, 0.0, 10.0)
         _number("scan_dropout", self.scan_dropout, 0.0, 1.0)
         check_combinations(self)
+        object.__setattr__(self, "_map_files", tuple(map_file(name) for name in self.maps))
+
+    @property
+    def map_files(self) -> tuple[str, ...]:
+        """Where `maps` are read from: names of the paper's maps, and absolute paths that hold in any working folder."""
+        files: tuple[str, ...] = self.__dict__["_map_files"]
+        return files
+
+    def with_maps(self, maps: Sequence[str], files: Sequence[str]) -> SimConfig:
+        """Return a copy that calls its maps `maps` and reads them from `files`."""
+        copy = dataclasses.replace(self, maps=tuple(maps))
+        object.__setattr__(copy, "_map_files", tuple(map_file(file) for file in files))
+        return copy
 
     @property
     def max_humans(self) -> int:
@@ -198,7 +213,8 @@ class SimConfig:
         for name in changes:
             if name not in known:
                 raise ConfigError(f"Unknown setting {name!r}.{did_you_mean(name, known)} Known: {', '.join(known)}.")
-        return dataclasses.replace(self, **changes)
+        changed = dataclasses.replace(self, **changes)
+        return changed.with_maps(self.maps, self.map_files) if changed.maps == self.maps else changed
 
     def to_dict(self) -> dict[str, Any]:
         """Return the config as plain JSON values, later fields only where they differ from their defaults."""
@@ -333,5 +349,11 @@ def kernel_flags(config: SimConfig) -> NDArray[np.int64]:
 
 
 def orca_params(config: SimConfig) -> NDArray[np.float32]:
-    """Return ORCA's numbers (orca.py of the original): neighbours 10 m, 10 of them, horizons 5 s and 5 s, dt."""
-    return np.array([10.0, 10.0, 5.0, 5.0, config.sensor.dt], np.float32)
+    """Return ORCA's numbers in the order of ``_orca``'s ``OP_*``: those of the original's orca.py, and ours."""
+    neighbors_and_horizons = (10.0, 10.0, 5.0, 5.0)
+    return np.array([*neighbors_and_horizons, config.sensor.dt, keeps_speed_limit(config)], np.float32)
+
+
+def keeps_speed_limit(config: SimConfig) -> bool:
+    """Return whether ORCA's agents keep to their largest speed where RVO2's arithmetic exceeds it."""
+    return config.physics == "consistent"

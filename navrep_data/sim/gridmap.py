@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from navrep_data.errors import ArrayError, ConfigError, MapError
+from navrep_data.schema import MAX_COORDINATE
 from navrep_data.sim import _grid_lidar, _map_contours
 from navrep_data.sim._map_cache import cached_on_disk, content_hash
 
@@ -62,6 +63,16 @@ class GridMap:
             raise ConfigError(f"resolution is {self.resolution}, expected a positive number of metres: correct it.")
         if len(self.origin) != 2 or not all(math.isfinite(value) for value in self.origin):
             raise ConfigError(f"origin is {self.origin}, expected two finite numbers of metres: correct it.")
+        left, right, low, high = (
+            *(self.origin[0] + k * self.resolution for k in (0, occupancy.shape[0])),
+            *(self.origin[1] + k * self.resolution for k in (0, occupancy.shape[1])),
+        )
+        if max(-left, right, -low, high) > MAX_COORDINATE:
+            raise MapError(
+                f"Map '{self.name}' lies at x {left:.0f} to {right:.0f}, y {low:.0f} to {high:.0f} m, expected within "
+                f"{MAX_COORDINATE:.0f} m of 0, where float32 coordinates keep their millimetres: set the map's origin "
+                "near 0 and shift poses by as much."
+            )
         occupancy.setflags(write=False)
         object.__setattr__(self, "occupancy", occupancy)
 

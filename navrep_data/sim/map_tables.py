@@ -71,7 +71,7 @@ def map_world_data(config: SimConfig) -> MapWorldData:
     """
     scenarios = tuple(get_scenario(name) for name in config.scenarios)
     names = tuple(dict.fromkeys(s.map for s in scenarios)) if scenarios else config.maps
-    maps = tuple(load_map(name) for name in names)
+    maps = tuple(load_map(file) for file in (names if scenarios else config.map_files))
     pool = not scenarios and config.humans > 0
     rim = config.physics == "consistent"
     key = (config.scenarios, tuple(grid.hash for grid in maps), pool, rim)
@@ -202,7 +202,8 @@ def spawn_places(grid: GridMap, off_rim: bool = True) -> NDArray[np.float64]:
         passes = 0
         while passes < SPAWN_PASSES and grid.resolution * 2 ** (passes + 1) < SPAWN_RESOLUTION:
             passes += 1
-    coarse = grid.coarsened(passes)
+    # a map of few columns or rows cannot be halved as often
+    coarse = grid.coarsened(min(passes, min(grid.shape).bit_length() - 1))
     try:
         free = coarse.reachable((0.0, 0.0), SPAWN_CLEARANCE)
     except MapError:

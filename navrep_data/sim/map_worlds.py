@@ -13,7 +13,7 @@ from navrep_data.sim import _layout as lay
 from navrep_data.sim._ellipse import ELLIPSE_COLUMNS
 from navrep_data.sim._ian_contact import swept_cells
 from navrep_data.sim._orca import make_orca_work
-from navrep_data.sim.config import SimConfig, kernel_flags, kernel_params
+from navrep_data.sim.config import SimConfig, keeps_speed_limit, kernel_flags, kernel_params
 from navrep_data.sim.lidar import ray_directions
 from navrep_data.sim.map_tables import RADIUS, MapWorldData, map_world_data
 
@@ -119,7 +119,7 @@ class MapArrays:
         self.orca = il.OrcaTables(
             edges_f=edges_f,
             edges_i=edges_i,
-            params=np.array([*ORCA_ON_MAPS, config.sensor.dt], np.float32),
+            params=np.array([*ORCA_ON_MAPS, config.sensor.dt, keeps_speed_limit(config)], np.float32),
             agents=np.zeros((agents, 6), np.float32),
             work_f=work_f,
             work_i=work_i,

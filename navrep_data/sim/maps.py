@@ -19,6 +19,7 @@ from navrep_data.sim._map_cache import RecentArrays
 from navrep_data.sim._maps import (
     YAML_SUFFIXES,
     MapDescription,
+    is_bare,
     occupancy_of,
     packaged_folder,
     read_description,
@@ -63,12 +64,13 @@ def load_map(name_or_path: str | os.PathLike[str], *, occupancy: OccupancyRule |
     ----------
     name_or_path : str or path-like
         One of :func:`map_names`, or the path of a map_server YAML file or of a folder with one. A bare word is a name
-        first.
+        first. Its files may be links. Coordinates must lie within 16 km of the origin.
     occupancy : {"original", "ros"}, optional
         How grey values v become occupancies. "original" is ``1 - v / 254``, the rule of the software behind the paper's
         maps; "ros" is ``(255 - v) / 255``, or ``v / 255`` with ``negate: 1``, the rule of map_server. The two part at
         the grey of unknown ground, 205: 0.193 and 0.196, below and above the usual free_thresh of 0.196. Default: the
-        paper's maps as the original reads them, all others as map_server does.
+        paper's maps as the original reads them, all others as map_server does. Of colours, "ros" takes the mean of the
+        channels as map_server does, alpha among them unless ``mode: scale``; "original" takes the luma.
 
     Returns
     -------
@@ -97,7 +99,7 @@ def load_map(name_or_path: str | os.PathLike[str], *, occupancy: OccupancyRule |
     description = read_description(path, packaged=packaged)
     rule: OccupancyRule = occupancy or ("original" if packaged else "ros")
     stamps = [(file.stat().st_mtime_ns, file.stat().st_size) for file in (path, description.image_path)]
-    key = (str(description.yaml_path), rule, *stamps)
+    key = (str(description.yaml_path), str(description.image_path), rule, *stamps)
     if key in _maps:
         _maps.move_to_end(key)
         return _maps[key]
@@ -112,8 +114,7 @@ def _find(name_or_path: str | os.PathLike[str]) -> tuple[Path, bool]:
     """Return the YAML file that is meant, and whether it is one of the paper's."""
     text = os.fspath(name_or_path)
     path = Path(text)
-    bare = isinstance(name_or_path, str) and path.name == text and path.suffix not in YAML_SUFFIXES
-    if not bare:
+    if not (isinstance(name_or_path, str) and is_bare(text)):
         return (yaml_in_folder(path) if path.is_dir() else path), False
     is_folder = text != "" and path.is_dir()
     try:
@@ -138,9 +139,10 @@ def _read(description: MapDescription, name: str, rule: OccupancyRule) -> GridMa
         raise ConfigError(
             f"{description.yaml_path} has negate: 1, which occupancy='original' ignores: read it with occupancy='ros'."
         )
+    sums, channels = read_grey(description.image_path, rule, description.mode)
     grid = GridMap(
         name=name,
-        occupancy=occupancy_of(read_grey(description.image_path), rule, description.negate),
+        occupancy=occupancy_of(sums, rule, description.negate, channels),
         resolution=description.resolution,
         origin=description.origin,
         occupied_threshold=description.occupied_threshold,

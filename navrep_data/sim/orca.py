@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from navrep_data.errors import ConfigError
+from navrep_data.schema import MAX_COORDINATE
 from navrep_data.sim._obstacles import build_obstacles, make_obstacles
 from navrep_data.sim._orca import (
     ORCA_AGENT_FIELDS,
@@ -96,6 +97,7 @@ def orca_velocities(
         _above_zero("time_horizon", time_horizon),
         _above_zero("time_horizon_obst", time_horizon_obst),
         _above_zero("time_step", time_step),
+        0.0,  # to the bit as RVO2, largest speed or not
     )
     obst_f, obst_i, n_obst = obstacle_arrays(polygons)
     work_f, work_i = make_orca_work(obst_f.shape[1], n)
@@ -152,6 +154,11 @@ def _matrix(name: str, value: ArrayLike, n: int | None) -> NDArray[np.float64]:
             f"{name} has shape {array.shape}; expected ({'N' if n is None else n}, 2). Pass rows of x, y."
         )
     _check_finite(name, array)
+    if array.size and np.abs(array).max() > MAX_COORDINATE:
+        raise ConfigError(
+            f"{name} holds {np.abs(array).max():g}; expected coordinates within {MAX_COORDINATE:.0f} m of 0, where "
+            "float32 keeps their millimetres. Subtract a common offset."
+        )
     return np.ascontiguousarray(array)
 
 

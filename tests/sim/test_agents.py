@@ -105,6 +105,17 @@ def test_a_differential_drive_has_no_sideways_motion():
     for command in ([0.5, 0.7, 0.4], [0.8, -0.3, -1.0]):
         sim.step([command])
         free.step([[command[0], 0.0, command[2]]])
+        # along the heading, where a holonomic robot shows the last step's velocity in the frame that it has turned to
+        np.testing.assert_allclose(sim.robot_states()[0, 2:], [command[0], 0.0, command[2]], atol=1e-7)
+        sim.arrays.agents[0, 0, [lay.A_VX, lay.A_VY]] = free.arrays.agents[0, 0, [lay.A_VX, lay.A_VY]]
+        np.testing.assert_array_equal(sim.arrays.agents, free.arrays.agents)
+
+
+def test_a_differential_drive_of_the_original_is_a_command_without_vy():
+    sim, free = alone(drive="differential", physics="original"), alone(physics="original")
+    for command in ([0.5, 0.7, 0.4], [0.8, -0.3, -1.0]):
+        sim.step([command])
+        free.step([[command[0], 0.0, command[2]]])
     np.testing.assert_array_equal(sim.arrays.agents, free.arrays.agents)
 
 

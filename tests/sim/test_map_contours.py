@@ -109,7 +109,7 @@ def chosen_velocity(tables, position, others, number=None):
     if table is None:
         table = orca_table(*position, tables.x0, tables.y0, tables.bucket, tables.index)
     agents = np.array([[*position, 0.3, 0.4, 0.3, 0.8], *others], np.float32)
-    params = np.array([5.0, 10, 5.0, 2.0, 0.2], np.float32)
+    params = np.array([5.0, 10, 5.0, 2.0, 0.2, 0.0], np.float32)
     work_f, work_i = make_orca_work(tables.edges_f.shape[2], 16)
     return orca_velocity(
         0, agents, 0, len(agents), -1, np.float32(0.3), np.float32(0.5), tables.edges_f[table], tables.edges_i[table],

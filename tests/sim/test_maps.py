@@ -293,7 +293,6 @@ HOSTILE_IMAGES = {
     "png bomb": (png_claiming(10000, 10000), "10000 x 10000 pixels, expected at most 67,108,864"),
     "png cut": (png_claiming(3000, 3000), "cannot be read as an image"),
     "16 bit": (saved(np.full((3, 3), 60000, np.uint16)), "mode I;16"),
-    "alpha": (saved(np.full((3, 3, 4), 200, np.uint8)), "mode RGBA"),
     "another format": (saved(np.full((3, 3), 254, np.uint8), "BMP"), "cannot be read as an image"),
     "no free cell": (pgm(np.zeros((3, 3))), "no free cell"),
     "only unknown": (pgm(np.full((3, 3), 205)), "no free cell"),
@@ -307,13 +306,70 @@ def test_hostile_images_are_refused(case, tmp_path):
         load_map(write_map(tmp_path, pixels=image))
 
 
-def test_links_out_of_the_folder_are_refused(tmp_path):
-    write_map(tmp_path / "outside")
-    path = write_map(tmp_path / "m")
-    (tmp_path / "m" / "map.pgm").unlink()
-    (tmp_path / "m" / "map.pgm").symlink_to(tmp_path / "outside" / "map.pgm")
-    with pytest.raises(MapError, match="link that leaves the folder"):
-        load_map(path)
+def test_files_may_be_links_into_a_store(tmp_path):
+    """As those of tools that keep large files elsewhere, under other names."""
+    (tmp_path / "store").mkdir()
+    expected = load_map(write_map(tmp_path / "m"))
+    for k, name in enumerate(("map.yaml", "map.pgm")):
+        (tmp_path / "m" / name).rename(tmp_path / "store" / str(k))
+        (tmp_path / "m" / name).symlink_to(tmp_path / "store" / str(k))
+    for path in (tmp_path / "m", tmp_path / "m" / "map.yaml"):
+        found = load_map(path)
+        assert (found.hash, found.name) == (expected.hash, "map")
+    # one description, two images
+    write_map(tmp_path / "n", pixels=pgm([[0, 254]]))
+    (tmp_path / "n" / "map.yaml").unlink()
+    (tmp_path / "n" / "map.yaml").symlink_to(tmp_path / "store" / "0")
+    assert load_map(tmp_path / "n").shape == (2, 1)
+    (tmp_path / "store" / "1").unlink()
+    with pytest.raises(MapError, match=r"'map\.pgm' does not exist in .*m: put it there"):
+        load_map(tmp_path / "m")
+
+
+@pytest.mark.parametrize("yaw", ["1e-12", "-0.0", "6.283185307179586", "-6.2831853", "12.566370614"])
+def test_an_origin_turned_by_nothing_or_whole_turns_is_not_turned(yaw, tmp_path):
+    assert load_map(write_map(tmp_path, origin=f"[-1.0, 2.0, {yaw}]")).origin == (-1.0, 2.0)
+
+
+@pytest.mark.parametrize("mode", [None, "scale"])
+@pytest.mark.parametrize(
+    "colour",
+    [
+        (255, 255, 0),
+        (0, 255, 0),
+        (150, 150, 255),
+        (205, 205, 205),
+        (254, 254, 254, 0),
+        (254, 254, 254, 255),
+        (0, 0, 0, 255),
+    ],
+)
+def test_colours_count_by_the_mean_of_their_channels(colour, mode, tmp_path):
+    """As in map_server, whose trinary mode counts alpha as a channel, too."""
+    pixels = np.full((2, 2, len(colour)), 255, np.uint8)
+    pixels[0, 0] = colour
+    grid = load_map(write_map(tmp_path, pixels=saved(pixels), mode=mode))
+    counted = colour if mode is None else colour[:3]
+    assert grid.occupancy[0, 1] == pytest.approx((255.0 - sum(counted) / len(counted)) / 255.0, abs=1e-6)
+
+
+def test_palettes_and_grey_with_alpha_count_as_colours(tmp_path):
+    grey = np.full((2, 2, 2), 255, np.uint8)
+    grey[0, 0] = 205, 55
+    image = Image.new("P", (2, 2), 1)
+    image.putpalette([255, 255, 0, 255, 255, 255])
+    image.putpixel((0, 0), 0)
+    palette = io.BytesIO()
+    image.save(palette, "PNG")
+    for k, (pixels, mean) in enumerate(((saved(grey), (3 * 205 + 55) / 4), (palette.getvalue(), 170.0))):
+        grid = load_map(write_map(tmp_path / str(k), pixels=pixels))
+        assert grid.occupancy[0, 1] == pytest.approx((255.0 - mean) / 255.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("origin", ["[456000, 5428000, 0]", "[0, -16385, 0]", "[16383.0, 0, 0]"])
+def test_maps_far_from_the_origin_are_refused(origin, tmp_path):
+    with pytest.raises(MapError, match=r"expected within 16384 m of 0.*: set the map's origin near 0"):
+        load_map(write_map(tmp_path, origin=origin))
 
 
 def test_missing_files_and_ambiguous_folders(tmp_path):

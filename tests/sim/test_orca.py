@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 from navrep_data.errors import ConfigError
+from navrep_data.sim import Simulator, make_config
 from navrep_data.sim._obstacles import build_obstacles, make_obstacles
 from navrep_data.sim._orca import make_orca_work, orca_velocity
 from navrep_data.sim._orca_lp import program2, program3
 from navrep_data.sim._orca_neighbors import WORK_EDGE, WORK_LINE, WORK_PROJ, obstacle_neighbors
+from navrep_data.sim.config import orca_params
 from navrep_data.sim.orca import obstacle_arrays, orca_velocities
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -371,7 +373,7 @@ def test_an_agent_sees_its_rows_and_the_extra_one(extra):
         with np.errstate(all="ignore"):
             got = orca_velocity(
                 3, rows, 1, 8, extra, np.float32(s.preferred[3, 0]), np.float32(s.preferred[3, 1]), f, i, n,
-                np.array(SETTINGS, np.float32), *make_orca_work(f.shape[1], 8),
+                np.array([*SETTINGS, 0.0], np.float32), *make_orca_work(f.shape[1], 8),
             )  # fmt: skip
         # an agent that nobody sees is out of range
         if extra < 0:
@@ -386,9 +388,26 @@ def test_the_robot_outside_the_rows_sees_all_of_them():
     with np.errstate(all="ignore"):
         got = orca_velocity(
             0, rows, 1, 6, -1, np.float32(s.preferred[0, 0]), np.float32(s.preferred[0, 1]), f, i, n,
-            np.array(SETTINGS, np.float32), *make_orca_work(f.shape[1], 6),
+            np.array([*SETTINGS, 0.0], np.float32), *make_orca_work(f.shape[1], 6),
         )  # fmt: skip
     np.testing.assert_array_equal(np.float32(got), rvo2(s)[0][0])
+
+
+@pytest.mark.parametrize("physics", ["consistent", "original"])
+def test_the_largest_speed_holds_in_consistent_physics(physics):
+    """A crowd in which RVO2 lets a human of this world go 0.076 m/s faster than it can."""
+    sim = Simulator(make_config("soadrl"), 1, seed=2, first_sequence=28)
+    sim.arrays.orca_params[:] = orca_params(make_config("soadrl", physics=physics))
+    excess = []
+    for _ in range(49):
+        sim.step(np.zeros((1, 3)))
+        humans = sim.state().humans
+        excess.append(float((np.hypot(humans[:, 2], humans[:, 3]) - humans[:, 8]).max()))
+    if physics == "consistent":
+        assert max(excess) <= 1.1e-5
+    else:
+        assert max(excess[:-1]) < 1e-4
+        assert excess[-1] > 0.07
 
 
 def test_no_agents_and_no_obstacles():

@@ -3,6 +3,7 @@
 import numba
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from navrep_data.errors import ConfigError, SimulationError, UnknownNameError
 from navrep_data.sim import Simulator, _original, environment_names, make_config, numpy_seed
@@ -262,3 +263,58 @@ def test_all_numbered_episodes_can_be_drawn():
         sim = Simulator(make_config(env, physics="original"))
         for k in range(count):
             sim.reset_seeded([numpy_seed(env, k)])
+
+
+PAD = 60
+LEAP = 0.2 * np.sqrt(2.0)
+
+
+def ways_to_the_goal(sim: Simulator) -> tuple[bool, bool]:
+    """Return whether the robot gets to the goal by steps from cell to neighbouring cell, and by the longest leaps.
+
+    Whether a place is a collision depends on its cell alone (SIM_FACTS a.8), off the grid on the border too. The first
+    is a way that a robot can drive slowly; where not even leaps lead there, which pass over what lies between as the
+    original's steps do, there is none.
+    """
+    a, scalars = sim.arrays, sim.arrays.scalars[0]
+    x, y, gx, gy, radius = a.agents[0, 0, [lay.A_X, lay.A_Y, lay.A_GX, lay.A_GY, lay.A_RADIUS]]
+    solid = np.zeros((140, 140), bool)
+    for x0, x1, y0, y1, step in a.boxes[0, : int(scalars[lay.S_POLYGONS]) - 1].astype(int):
+        columns, rows = (np.arange(low, high) for low, high in ((x0, x1), (y0, y1)))
+        solid[np.ix_(columns[columns % step == 0], rows[rows % step == 0])] = True
+    half = int(np.ceil(radius / np.sqrt(2.0) / 0.1))
+    solid = np.pad(solid, PAD)
+    hit = np.zeros_like(solid)
+    for i in range(-half, half):
+        for j in range(-half, half):
+            hit |= np.roll(solid, (-i, -j), (0, 1))
+    centre = (np.arange(len(solid)) - PAD) * 0.1 - 7.0
+    inside = [
+        (centre + 0.05 > scalars[low] + radius) & (centre - 0.05 < scalars[high] - radius)
+        for low, high in ((lay.S_XMIN, lay.S_XMAX), (lay.S_YMIN, lay.S_YMAX))
+    ]
+    free = ~hit & inside[0][:, None] & inside[1]
+    start = np.zeros_like(free)
+    start[tuple(int(np.rint((v + 7.0) / 0.1)) + PAD for v in (x, y))] = True
+    to_goal = [np.maximum(np.abs(centre - g) - 0.05, 0.0) for g in (gx, gy)]
+    goal = np.hypot(to_goal[0][:, None], to_goal[1]) < radius
+    gaps = np.maximum(np.abs(np.arange(-4, 5)) - 1, 0) * 0.1
+    leaps = np.hypot(gaps[:, None], gaps) <= LEAP
+    found = [
+        bool((ndimage.binary_dilation(start, shape, iterations=-1, mask=free | start) & goal).any())
+        for shape in (None, leaps)
+    ]
+    return found[0], found[1]
+
+
+@pytest.mark.slow
+def test_three_worlds_of_val_have_no_way_to_the_goal():
+    """What docs/environments.md says of the seeds 0 to 199."""
+    sim = Simulator(make_config("navrep-val", physics="original"))
+    driven, leapt = [], []
+    for seed in range(200):
+        sim.reset_seeded([seed])
+        by_steps, by_leaps = ways_to_the_goal(sim)
+        driven += [] if by_steps else [seed]
+        leapt += [] if by_leaps else [seed]
+    assert driven == leapt == [15, 167, 198]

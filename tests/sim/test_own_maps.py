@@ -21,6 +21,7 @@ from navrep_data.sim import (
     scenarios,
 )
 from navrep_data.sim.map_tables import spawn_places
+from navrep_data.sim.maps import GridMap, planning_map
 
 FREE, SOLID = 254, 0
 
@@ -72,6 +73,22 @@ def test_humans_start_free_and_stay_out_of_walls(path: str, policy: str) -> None
     assert (moved > 1.0).any() != (policy == "static")
 
 
+@pytest.mark.parametrize(("shape", "resolution", "room"), [
+    ((1, 200), 0.05, False), ((200, 1), 0.05, False), ((3, 60), 0.1, False), ((1, 1), 0.05, False),
+    ((1, 9), 1.5, True), ((9, 1), 2.0, True), ((1, 1), 4.0, True),
+])  # fmt: skip
+@pytest.mark.parametrize("name", ["thin", "crowdmove1"])
+def test_maps_of_one_column_or_row(name: str, shape: tuple[int, int], resolution: float, room: bool) -> None:
+    """They serve where a robot fits on them; else it is said that none does, not that halving them failed."""
+    grid = GridMap(name, np.zeros(shape), resolution, (0.0, 0.0), source=f"{name}.yaml")
+    assert planning_map(grid).shape == shape
+    if room:
+        assert len(spawn_places(grid)) == max(shape)
+    else:
+        with pytest.raises(MapError, match=r"no place that is 0\.5 m from all walls"):
+            spawn_places(grid)
+
+
 @pytest.mark.parametrize("robots", [1, 2])
 def test_robot_states_are_those_of_observe(path: str, robots: int) -> None:
     simulator = Simulator(make_config("map", maps=(path,), humans=0, robots=robots), 2, seed=2)
@@ -79,6 +96,40 @@ def test_robot_states_are_those_of_observe(path: str, robots: int) -> None:
     states = simulator.robot_states()
     np.testing.assert_array_equal(states, simulator.observe()[1])
     assert states[..., 4] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("robots", [1, 2])
+@pytest.mark.parametrize("inertia", ["none", "limited"])
+def test_a_differential_robot_never_slides_sideways(path: str, inertia: str, robots: int) -> None:
+    """Whatever it is told, its steps and the velocity that it shows lie along its heading."""
+    config = make_config("map", maps=(path,), humans=0, robots=robots, drive="differential", inertia=inertia)
+    simulator = Simulator(config, 4, seed=3)
+    commands = np.repeat(np.random.default_rng(0).uniform(-1, 1, (6, 4, robots, 3)), 5, axis=0)
+    moved = 0.0
+    for command in commands:
+        before = np.stack([simulator.state(w).robots[:, :3] for w in range(4)])
+        simulator.step(command if robots > 1 else command[:, 0])
+        after = np.stack([simulator.state(w).robots[:, :3] for w in range(4)])
+        step, heading = after[..., :2] - before[..., :2], before[..., 2]
+        sideways = np.cos(heading) * step[..., 1] - np.sin(heading) * step[..., 0]
+        assert np.abs(sideways).max() < 1e-9
+        states = simulator.robot_states()
+        assert np.abs(states[..., 3]).max() == 0.0
+        moved = max(moved, float(np.abs(states[..., 2]).max()))
+    assert moved > 0.3
+
+
+def test_inertia_of_a_differential_robot_keeps_its_limits(path: str) -> None:
+    limits = {"robot_acceleration": (0.6, 0.4, 1.5), "robot_jerk": (2.0, 1.0, 4.0)}
+    config = make_config("map", maps=(path,), humans=0, drive="differential", inertia="limited", **limits)
+    simulator = Simulator(config, 1, seed=3)
+    speeds = []
+    for command in np.repeat(np.random.default_rng(0).uniform(-0.5, 0.5, (6, 1, 3)), 7, axis=0):
+        simulator.step(command)
+        speeds.append(simulator.robot_states()[0, [2, 4]].astype(float))
+    change = np.diff(speeds, axis=0) / 0.2
+    assert (np.abs(change) <= np.array([0.6, 1.5]) + 1e-6).all()
+    assert (np.abs(np.diff(change, axis=0)) <= np.array([2.0, 4.0]) * 0.2 + 1e-5).all()
 
 
 def test_orca_robot_finds_the_door(path: str) -> None:
