@@ -16,6 +16,10 @@ def verify_command(
         int | None, typer.Option("--regenerate", metavar="K", help="Simulate K random sequences again and compare.")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Which sequences.", show_default="random")] = None,
+    maps: Annotated[
+        list[str] | None,
+        typer.Option("--map", help="With --regenerate: where the dataset's own map is now; may be repeated."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Check every file of a dataset: hashes, schema, index, ranges, rings. Exits 2 if anything is wrong."""
@@ -27,7 +31,7 @@ def verify_command(
     if regenerate is not None and report.ok:
         from navrep_data.generate import regenerate as make_again
 
-        again = make_again(root, regenerate, seed)
+        again = make_again(root, regenerate, seed, maps or ())
     if as_json:
         print_json({**report.to_dict(), **({"regenerated": again.to_dict()} if again else {})})
     else:

@@ -12,6 +12,7 @@ from typing import Any
 
 from navrep_data.errors import ConfigError, DatasetMismatchError
 from navrep_data.generate.executors import EXECUTORS, LocalExecutor, RayExecutor
+from navrep_data.generate.maps import named_from
 from navrep_data.generate.parts import Part, parse_part
 from navrep_data.generate.plan import Request, check_count, check_folder, check_same, check_settings, make_request
 from navrep_data.generate.policy import load_callable, make_policy
@@ -180,6 +181,7 @@ def generate(
     root = Path(out) if out is not None else Path("data") / env
     if executor != "local":
         root = root.absolute()  # workers elsewhere have other working folders
+    config = named_from(config, root)
     settings = check_settings(config, length, scan_dtype, rings, humans_column)
     request = make_request(root, config, settings, chosen, seed, n, shard_size, storage, part)
     request = replace(

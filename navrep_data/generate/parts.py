@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data.errors import ConfigError, DatasetError, DatasetMismatchError, DatasetNotFoundError
+from navrep_data.generate.maps import check_one_map_each
 from navrep_data.generate.storage import FolderStore
 from navrep_data.shards import MANIFEST_FILE, Manifest, ShardEntry, dataset_card, writer_lock
 
@@ -115,6 +116,7 @@ def merge_manifest(root: Path | str, report: Callable[[str], None] | None = None
         _check_all(found)
         entries = [entry for _, manifest in found for entry in manifest.shards]
         _check_files(root, entries)
+        check_one_map_each(root, found)
         merged = first.with_shards(entries, complete=True)
         merged = merged.save(root, dataset_card(merged))
         shutil.rmtree(root / PARTS)

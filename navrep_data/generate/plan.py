@@ -18,6 +18,7 @@ from navrep_data.errors import (
     FolderInUseError,
     FolderNotWritableError,
 )
+from navrep_data.generate.maps import check_unchanged
 from navrep_data.generate.parts import PARTS, Part
 from navrep_data.generate.policy import PolicySpec
 from navrep_data.generate.storage import STAGING
@@ -241,7 +242,7 @@ def check_folder(root: Path, part: Part | None = None) -> None:
 
 
 def check_same(old: Manifest, request: Request, explicit_shard_size: bool) -> None:
-    """Make sure that an existing dataset was made with the settings of this request, all but n.
+    """Make sure that an existing dataset was made with the settings of this request, all but n and on the same maps.
 
     Raises
     ------
@@ -266,7 +267,7 @@ def check_same(old: Manifest, request: Request, explicit_shard_size: bool) -> No
     ]
     # fields at their defaults are left out of stored configs, and older versions did not know all of them
     before, after = complete_config(old.config), complete_config(new.config)
-    pairs += [(key, before.get(key), value) for key, value in after.items()]
+    pairs += [(key, before.get(key), value) for key, value in after.items() if key != "maps"]
     if explicit_shard_size:
         pairs.append(("shard_size", old.shard_size, new.shard_size))
     for field, seen, asked in pairs:
@@ -275,6 +276,7 @@ def check_same(old: Manifest, request: Request, explicit_shard_size: bool) -> No
                 f"{request.spec.root} was made with {field}={seen}, asked for {field}={asked}; "
                 "repeat the old setting to go on with it, or choose another --out."
             )
+    check_unchanged(request.spec.root, old, request.spec.config)
     if request.n < old.planned:
         raise DatasetMismatchError(
             f"{request.spec.root} was made with n={old.planned}, asked for n={request.n}; a dataset only grows: "

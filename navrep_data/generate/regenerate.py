@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from navrep_data.errors import ConfigError, DatasetError
+from navrep_data.generate.maps import find_maps
 from navrep_data.generate.policy import PolicySpec, make_rollout
 from navrep_data.generate.worker import DatasetSpec, new_writer
 from navrep_data.schema import SCAN_SCALE
@@ -71,8 +73,8 @@ class RegenerateReport:
         return {"ok": self.ok, "sequences": [asdict(c) for c in self.comparisons]}
 
 
-def recipe_of(root: Path, manifest: Manifest) -> DatasetSpec:
-    """Return what makes a dataset, from its manifest alone.
+def recipe_of(root: Path, manifest: Manifest, maps: Sequence[str] = ()) -> DatasetSpec:
+    """Return what makes a dataset, from its manifest and the maps that it names, or those at the paths `maps`.
 
     Raises
     ------
@@ -80,12 +82,14 @@ def recipe_of(root: Path, manifest: Manifest) -> DatasetSpec:
         If it was not generated (an import, for example).
     ConfigError, PolicyError
         If this version cannot simulate it, or its policy cannot be imported.
+    MapError, DatasetMismatchError
+        If a map is not found, or is not the one that it was made on.
     """
     if manifest.source:
         raise DatasetError(f"{root} was made out of other datasets ({manifest.command}); regenerate from those.")
     if "name" not in manifest.policy or "env" not in manifest.config:
         raise DatasetError(f"{root} was not made by `navrep-data generate`; there is no recipe to make it again from.")
-    config = SimConfig.from_dict(manifest.config)
+    config = find_maps(root, manifest, SimConfig.from_dict(manifest.config), maps)
     settings = RolloutSettings(
         manifest.length, manifest.scan_dtype, "rings" in manifest.columns, "humans" in manifest.columns
     )
@@ -99,7 +103,7 @@ def recipe_of(root: Path, manifest: Manifest) -> DatasetSpec:
     return DatasetSpec(root, config, settings, policy, manifest.seed, manifest.columns)
 
 
-def regenerate(root: Path | str, k: int, seed: int | None = None) -> RegenerateReport:
+def regenerate(root: Path | str, k: int, seed: int | None = None, maps: Sequence[str] = ()) -> RegenerateReport:
     """Simulate `k` random sequences of a dataset again from its manifest, and compare.
 
     Parameters
@@ -110,6 +114,9 @@ def regenerate(root: Path | str, k: int, seed: int | None = None) -> RegenerateR
         Number of sequences; all of them if there are fewer.
     seed : int, optional
         Chooses the sequences; a new choice each time by default.
+    maps : sequence of str, optional
+        Paths of the dataset's maps, in their order, where they are not found: a relative path is looked for from the
+        dataset's folder, then from the working folder.
 
     Returns
     -------
@@ -122,6 +129,8 @@ def regenerate(root: Path | str, k: int, seed: int | None = None) -> RegenerateR
         If `k` is not at least 1.
     DatasetError, ConfigError, PolicyError
         If the dataset cannot be made again.
+    MapError, DatasetMismatchError
+        If a map is not found, or is not the one that the dataset was made on.
     CorruptDataError
         If a shard is damaged.
     """
@@ -130,7 +139,7 @@ def regenerate(root: Path | str, k: int, seed: int | None = None) -> RegenerateR
         raise ConfigError(f"--regenerate is {k!r}, expected a whole number of at least 1.")
     with DatasetFolder(root) as folder:
         manifest = folder.manifest
-        spec = recipe_of(root, manifest)
+        spec = recipe_of(root, manifest, maps)
         everything = [s for entry in manifest.shards for s in range(*entry.sequences)]
         chosen = sorted(random.Random(seed).sample(everything, min(k, len(everything))))
         rollout = make_rollout(spec.config, spec.settings, spec.policy, spec.seed)

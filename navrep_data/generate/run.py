@@ -53,7 +53,12 @@ class Run:
         self._unsaved = False
         if (self.home / MANIFEST_FILE).exists():
             self.manifest = self._resume(explicit_shard_size)
-            self.request = replace(request, shard_size=self.manifest.shard_size)
+            # the dataset keeps calling its maps what it called them first
+            config = request.spec.config
+            called = config.with_maps(self.manifest.config.get("maps", config.maps), config.map_files)
+            self.request = replace(
+                request, spec=replace(request.spec, config=called), shard_size=self.manifest.shard_size
+            )
         else:
             check_storage(self.store)
             self.manifest = new_manifest(request)

@@ -1,0 +1,97 @@
+"""Own maps of datasets: found again from other folders, and refused where they are not what the dataset was made on."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from navrep_data.errors import DatasetMismatchError, MapError
+from navrep_data.generate import generate, merge_manifest, regenerate
+from navrep_data.shards import Manifest
+from navrep_data.sim import load_map, make_config
+from navrep_data.sim.map_tables import map_world_data
+
+SETTINGS = {"env": "map", "humans": 0, "length": 4, "shard_size": 1, "rings": False}
+
+
+def draw(folder: Path, wall: int = 0) -> None:
+    """Write a map of 5 x 4 m; with a wall of so many cells."""
+    grey = np.full((40, 50), 254, np.uint8)
+    grey[[0, -1], :] = grey[:, [0, -1]] = 0
+    grey[20, 20 : 20 + wall] = 0
+    folder.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(grey).save(folder / "map.png")
+    (folder / "map.yaml").write_text(
+        "image: map.png\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
+        encoding="utf-8",
+    )
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a working folder with a map in ``a/m``."""
+    draw(tmp_path / "a" / "m")
+    (tmp_path / "b").mkdir()
+    monkeypatch.chdir(tmp_path / "a")
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_a_dataset_is_not_extended_on_an_edited_map(here: Path) -> None:
+    generate(n=1, out="../d", maps=["./m"], **SETTINGS)
+    before = (here / "d" / "manifest.json").read_bytes()
+    draw(here / "a" / "m", wall=9)
+    with pytest.raises(DatasetMismatchError, match=r"made on a map 'map' with content \w{12}, asked for .*edited"):
+        generate(n=2, out="../d", maps=["./m"], **SETTINGS)
+    with pytest.raises(DatasetMismatchError, match="has been edited, or is another one"):
+        regenerate("../d", 1)
+    assert (here / "d" / "manifest.json").read_bytes() == before
+
+
+@pytest.mark.slow
+def test_parts_made_on_two_maps_are_not_merged(here: Path) -> None:
+    generate(n=2, out="p", maps=["./m"], shard_range="0/2", **SETTINGS)
+    draw(here / "a" / "m", wall=9)
+    generate(n=2, out="p", maps=["./m"], shard_range="1/2", **SETTINGS)
+    with pytest.raises(DatasetMismatchError, match=r"Part 1/2 was made on another map 'map'.* than part 0/2"):
+        merge_manifest("p")
+
+
+@pytest.mark.slow
+def test_a_dataset_finds_its_map_from_another_folder(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    generate(n=1, out="../d", maps=["./m"], **SETTINGS)
+    assert Manifest.read(here / "d").config["maps"] == ["../a/m"], "from the dataset's folder"
+    monkeypatch.chdir(here / "b")
+    assert [found.verdict for found in regenerate("../d", 1).comparisons] == ["equal bytes"]
+    # the same map by other paths
+    shutil.copytree(here / "a" / "m", here / "copy")
+    for n, path in enumerate(("../a/m", str(here / "a" / "m" / "map.yaml"), "../copy"), start=2):
+        assert generate(n=n, out="../d", maps=[path], **SETTINGS).sequences == n
+    assert Manifest.read(here / "d").config["maps"] == ["../a/m"]
+    whole = generate(n=4, out="../e", maps=["../a/m"], **SETTINGS)
+    d, e = (Manifest.read(here / name).shards for name in "de")
+    assert [entry.sha256 for entry in d] == [entry.sha256 for entry in e], "however it grew"
+    assert whole.sequences == 4
+    # the map is gone, and named anew
+    shutil.rmtree(here / "a")
+    with pytest.raises(MapError, match=r"Map '\.\./a/m' of .* is not at .*name its path by --map"):
+        regenerate("../d", 1)
+    assert regenerate("../d", 1, maps=["../copy"]).ok
+    with pytest.raises(MapError, match="2 maps are given by --map"):
+        regenerate("../d", 1, maps=["../copy", "../copy"])
+
+
+def test_a_config_reads_its_maps_from_where_they_were(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = make_config("map", maps=("./m",), humans=0)
+    expected = load_map("./m").hash
+    monkeypatch.chdir(here / "b")
+    assert config.maps == ("./m",)
+    for other in (config, pickle.loads(pickle.dumps(config)), config.replace(robots=2)):  # noqa: S301
+        assert map_world_data(other).maps[0].hash == expected
+    assert config == make_config("map", maps=("./m",), humans=0), "where a map is read from is no setting"
+    assert "map_files" not in config.full_dict()
