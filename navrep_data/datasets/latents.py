@@ -280,6 +280,7 @@ class LatentDataset(Dataset[Batch]):
         stride = window if stride is None else check_rows("stride", stride)
         self.root = Path(root)
         self.manifest = LatentManifest.read(self.root)
+        self.root = self.root.absolute()  # shards are read later, perhaps from another working folder
         self._rows, episodes = self._load(split)
         self.spec = BatchSpec(
             window=window, fields=_FIELDS, leading=action == "leading", targets=False, blank=False, normalized=False,

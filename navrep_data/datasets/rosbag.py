@@ -8,7 +8,7 @@ import platform
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from navrep_data.errors import ConfigError, DatasetError
 from navrep_data.io import new_folder, sha256_bytes, sha256_file
 from navrep_data.observations import scan_to_rings
 from navrep_data.observations.blind import describe_rays, runs_of
-from navrep_data.schema import COLUMNS, DT, RANGE_MAX, SensorContract
+from navrep_data.schema import COLUMNS, DT, MAX_COORDINATE, RANGE_MAX, SensorContract
 from navrep_data.shards import Manifest, ShardEntry, ShardWriter, dataset_card, publish
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -155,7 +155,8 @@ def import_rosbag(
     those that led to the next. Differences: rows are `dt` apart by the stamps in headers (by the time of recording
     where scans or odometry have none, or stamps of two clocks), each with the nearest scan and odometry; the scan is
     seen from the robot's centre with the usual 1080 rays (:class:`ScanAdapter`), each by its own description, 0 where
-    nobody saw anything; poses are kept. Goals in another frame are taken to the odometry's by ``/tf`` and
+    nobody saw anything; poses are kept, less a whole number of metres where they lie beyond 16 km, as `say` tells and
+    ``pose_origin`` in the manifest's config. Goals in another frame are taken to the odometry's by ``/tf`` and
     ``/tf_static`` as of when they came.
 
     An episode ends where its goal is reached (``goal``), or another goal comes, the sequence is full, or scans or
@@ -178,6 +179,7 @@ def import_rosbag(
             f"Nothing is left of {paths[0]}: its scans and odometry were never recorded at the same time; expected two "
             "rows at least."
         )
+    recordings, origin = near_zero(recordings, say)
     with new_folder(out, what="an import") as part:
         sensor = SensorContract(range_max=float(range_max), dt=float(dt))
         blind = _blind_rays(recordings, sensor, say)
@@ -186,6 +188,8 @@ def import_rosbag(
             {"--scan-topic": scan_topic, "--odometry-topic": odometry_topic, "--goal-topic": goal_topic},
         )  # fmt: skip
         manifest = _plan(recordings, env, sensor, length, rings, goal_radius, blind, command)
+        if origin is not None:
+            manifest = replace(manifest, config={**manifest.config, "pose_origin": list(origin)})
         return _write(part, manifest, recordings, rings, progress)
 
 
@@ -207,6 +211,25 @@ def _blind_rays(
             "rings, and declared in the manifest (blind_rays)"
         )
     return [[a, b] for a, b in runs_of(blind)]
+
+
+def near_zero(
+    recordings: Sequence[_Recording], say: Callable[[str], None]
+) -> tuple[list[_Recording], tuple[float, float] | None]:
+    """Return recordings with poses that float32 can store to the millimetre, and what was taken from x and y [m].
+
+    Poses beyond 16 km, as of odometry in UTM coordinates, are shifted by whole metres, all bags by the same.
+    """
+    poses = [piece.pose for r in recordings for piece in r.pieces]
+    if all(np.abs(pose[:, :2]).max() <= MAX_COORDINATE for pose in poses):
+        return list(recordings), None
+    x, y = (float(v) for v in np.rint(poses[0][0, :2]))
+    say(
+        f"poses lie beyond {MAX_COORDINATE:.0f} m of 0, where float32 loses millimetres: they are stored less "
+        f"({x:.0f}, {y:.0f}) m, which the manifest holds as pose_origin"
+    )
+    shift = np.array([x, y, 0.0])
+    return [replace(r, pieces=[replace(p, pose=p.pose - shift) for p in r.pieces]) for r in recordings], (x, y)
 
 
 def _check(

@@ -118,6 +118,8 @@ class DatasetFolder:
         self.root = Path(root)
         self.manifest = Manifest.read(self.root) if manifest is None else manifest
         self.origin = read_origin(self.root) if origin is None else origin
+        # shards are opened when they are read, perhaps by a worker or from another working folder
+        self.root = self.root.absolute()
         self._max_open = max(1, max_open)
         self._open: OrderedDict[int, Shard] = OrderedDict()
         self._lock, self._pid = threading.Lock(), os.getpid()

@@ -36,6 +36,33 @@ def rows_of(root):
         }
 
 
+def test_poses_far_from_the_origin_are_stored_near_it_and_said_to_be(tmp_path, monkeypatch):
+    """Odometry in UTM coordinates: the steps between poses keep their millimetres in float32."""
+    plain = rows_of_import(tmp_path, "plain")
+    odometry = Recorder.odometry
+
+    def far(self, seconds, x, y, *args, **kwargs):
+        odometry(self, seconds, x + 456000.0, y + 5428000.0, *args, **kwargs)
+
+    monkeypatch.setattr(Recorder, "odometry", far)
+    said = []
+    moved = rows_of_import(tmp_path, "far", say=said.append)
+    assert any("stored less (456000, 5428001) m, which the manifest holds as pose_origin" in line for line in said)
+    np.testing.assert_allclose(moved["robot_pose"] + [0, 1, 0], plain["robot_pose"], atol=1e-6)
+    with DatasetFolder(tmp_path / "far") as folder:
+        assert folder.manifest.config["pose_origin"] == [456000.0, 5428001.0]
+    with DatasetFolder(tmp_path / "plain") as folder:
+        assert "pose_origin" not in folder.manifest.config
+
+
+def rows_of_import(tmp_path, name, **settings):
+    """Rows of a bag of two seconds without goals."""
+    import_rosbag(
+        record(tmp_path / f"{name}-bag", KINDS[0], seconds=2.0, goals=()), tmp_path / name, dt=0.2, **settings
+    )
+    return rows_of(tmp_path / name)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_bag(tmp_path, kind):
     """Goal at x = 2, known from 0.35 s, reached (nearer than 0.5 m) after x = 1.5 (3.0 s): in the row at 3.2 s."""

@@ -30,6 +30,14 @@ def test_batches_are_those_of_a_plain_loader(root, dataset_of, num_workers):
             assert torch.equal(a[name], b[name])
 
 
+def test_a_dataset_opened_by_a_relative_path_is_read_from_any_working_folder(root, tmp_path, monkeypatch):
+    monkeypatch.chdir(root.parent)
+    dataset = SequenceDataset(root.name, None, window=8)
+    monkeypatch.chdir(tmp_path)
+    expected = SequenceDataset(root, None, window=8)[0]["robot_state"]
+    assert torch.equal(dataset[0]["robot_state"], expected)
+
+
 def test_shuffling_is_seeded_and_new_each_epoch(root):
     dataset = SequenceDataset(root, None, window=8)
 
