@@ -155,7 +155,7 @@ def import_rosbag(
     those that led to the next. Differences: rows are `dt` apart by the stamps in headers (by the time of recording
     where scans or odometry have none, or stamps of two clocks), each with the nearest scan and odometry; the scan is
     seen from the robot's centre with the usual 1080 rays (:class:`ScanAdapter`), each by its own description, 0 where
-    nobody saw anything; poses are kept, less a whole number of metres where they lie beyond 16 km, as `say` tells and
+    nobody saw anything; poses are kept, less a whole number of metres where they lie beyond 16 km, as `note` tells and
     ``pose_origin`` in the manifest's config. Goals in another frame are taken to the odometry's by ``/tf`` and
     ``/tf_static`` as of when they came.
 

@@ -46,7 +46,7 @@ def test_poses_far_from_the_origin_are_stored_near_it_and_said_to_be(tmp_path, m
 
     monkeypatch.setattr(Recorder, "odometry", far)
     said = []
-    moved = rows_of_import(tmp_path, "far", say=said.append)
+    moved = rows_of_import(tmp_path, "far", note=said.append)
     assert any("stored less (456000, 5428001) m, which the manifest holds as pose_origin" in line for line in said)
     np.testing.assert_allclose(moved["robot_pose"] + [0, 1, 0], plain["robot_pose"], atol=1e-6)
     with DatasetFolder(tmp_path / "far") as folder:
