@@ -18,6 +18,7 @@ from navrep_data.generate.plan import Request, check_count, check_folder, check_
 from navrep_data.generate.policy import load_callable, make_policy
 from navrep_data.generate.run import Run, Say, silent
 from navrep_data.generate.storage import check_url
+from navrep_data.generate.worker import DatasetSpec
 from navrep_data.io import translate_os_error
 from navrep_data.shards import MANIFEST_FILE, Manifest, writer_lock
 from navrep_data.sim import PolicyFunction, check_seed, make_config
@@ -188,10 +189,10 @@ def generate(
         request, command=_command(request, env, physics, humans, obstacles, legs, maps, shard_size, scan_dtype)
     )
 
-    def make_executor(tasks: int) -> LocalExecutor | RayExecutor:
+    def make_executor(spec: DatasetSpec, tasks: int) -> LocalExecutor | RayExecutor:
         if executor == "ray":
-            return RayExecutor(request.spec, None if workers is None else min(workers, tasks), address, say)
-        return LocalExecutor(request.spec, min(workers or 1, tasks))
+            return RayExecutor(spec, None if workers is None else min(workers, tasks), address, say)
+        return LocalExecutor(spec, min(workers or 1, tasks))
 
     run = _locked(request, say, shard_size is not None, lambda run: run.go(make_executor, progress))
     seconds = max(time.perf_counter() - run.began, 1e-6)

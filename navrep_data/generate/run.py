@@ -14,7 +14,7 @@ from navrep_data.generate.compiling import Compiling
 from navrep_data.generate.executors import LocalExecutor, RayExecutor
 from navrep_data.generate.plan import Request, check_manifest, check_same, check_space, new_manifest, versions
 from navrep_data.generate.storage import check_storage, check_visible
-from navrep_data.generate.worker import ShardTask, seconds_per_row
+from navrep_data.generate.worker import DatasetSpec, ShardTask, seconds_per_row
 from navrep_data.io import PART_SUFFIX
 from navrep_data.shards import MANIFEST_FILE, Manifest, ShardEntry, ShardRecipe, dataset_card, read_recipe
 
@@ -124,13 +124,13 @@ class Run:
                 tasks.append(ShardTask(index, first, stop, staged=first in starts))
         return tasks
 
-    def go(self, make_executor: Callable[[int], LocalExecutor | RayExecutor], progress: bool) -> None:
+    def go(self, make_executor: Callable[[DatasetSpec, int], LocalExecutor | RayExecutor], progress: bool) -> None:
         """Make what is missing and finish the manifest.
 
         Parameters
         ----------
         make_executor : callable
-            Returns who makes a given number of shards.
+            Returns who makes a given number of shards of what is to be made.
         progress : bool
             Whether to show a bar on stderr.
         """
@@ -142,7 +142,7 @@ class Run:
             self._finish()
             self.say(f"{self.home} already holds all {self.request.sequences} sequences; nothing to do.")
             return
-        with make_executor(len(tasks)) as executor:
+        with make_executor(self.request.spec, len(tasks)) as executor:
             self._announce(done_rows, executor, progress)
             if self._entries or not (self.home / MANIFEST_FILE).exists():
                 self._save()

@@ -21,7 +21,7 @@ _ENVIRONMENTS: dict[str, tuple[str, dict[str, Any]]] = {
         {"crossing": "circle", "humans": 5, "obstacles": 10, "polygon_scale": 1.25, "curriculum": "adaptive"},
     ),
     "navrep-val": (
-        "as navrep-train, with 50 numbered episodes; in original physics no way leads to the goal in number 15",
+        "as navrep-train, with 50 numbered episodes",
         {"crossing": "circle", "humans": 5, "obstacles": 10, "polygon_scale": 1.25},
     ),
     "navrep-test": (
@@ -74,7 +74,7 @@ def numpy_seed(env: str, episode: int) -> int:
     Notes
     -----
     The original places obstacles without asking whether a way to the goal is left. Of its worlds of ``navrep-val`` with
-    numpy seeds 0 to 199, those of 15, 167 and 198 have none; only the first is a numbered episode.
+    numpy seeds 0 to 199, that of 167 has none by small steps between the cells that it collides with.
     """
     env = environment_name(env)
     if env not in _NUMBERED:

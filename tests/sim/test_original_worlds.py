@@ -308,7 +308,7 @@ def ways_to_the_goal(sim: Simulator) -> tuple[bool, bool]:
 
 
 @pytest.mark.slow
-def test_three_worlds_of_val_have_no_way_to_the_goal():
+def test_one_world_of_val_has_no_way_to_the_goal_but_by_leaps():
     """What docs/environments.md says of the seeds 0 to 199."""
     sim = Simulator(make_config("navrep-val", physics="original"))
     driven, leapt = [], []
@@ -317,4 +317,4 @@ def test_three_worlds_of_val_have_no_way_to_the_goal():
         by_steps, by_leaps = ways_to_the_goal(sim)
         driven += [] if by_steps else [seed]
         leapt += [] if by_leaps else [seed]
-    assert driven == leapt == [15, 167, 198]
+    assert (driven, leapt) == ([167], [])
