@@ -58,7 +58,8 @@ def writer_lock(root: Path | str) -> Iterator[None]:
             raise translate_os_error(error, root) from error
         raise FolderNotWritableError(
             f"{path} belongs to user {_owner(path)} and cannot be opened by this one: {error.strerror}. If nobody "
-            f"writes the dataset, remove that file or ask its owner to: chmod g+w {path}; or choose another folder with --out."
+            f"writes the dataset, remove that file or ask its owner to: chmod g+w {path}; or choose another folder "
+            "with --out."
         ) from error
     except OSError as error:
         raise translate_os_error(error, root) from error
