@@ -8,6 +8,7 @@ and texts from outside as they are; :func:`one_line` makes what is shown of them
 from __future__ import annotations
 
 import difflib
+import operator
 import re
 from collections.abc import Iterable
 
@@ -162,6 +163,28 @@ class ModelNotFoundError(NavrepDataError, FileNotFoundError):
 
 class BlindSectorWarning(UserWarning):
     """Scans have directions that nobody saw, and nothing says that this is known."""
+
+
+def whole_number(value: object) -> int | None:
+    """Return what Python takes for an index as an int: int, numpy integer, tensor of one integer without axes.
+
+    Parameters
+    ----------
+    value : object
+        From a caller.
+
+    Returns
+    -------
+    int or None
+        None for all else: floats, even whole ones, truth values, lists, tensors with axes.
+    """
+    kind = str(getattr(value, "dtype", ""))
+    if isinstance(value, bool) or kind.endswith("bool") or getattr(value, "ndim", None) not in (None, 0):
+        return None
+    try:
+        return operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        return None
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

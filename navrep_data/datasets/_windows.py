@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 from navrep_data.datasets._batch import Assembler, BatchSpec, Lidar, choose_fields
 from navrep_data.datasets._index import Ints, WindowTable, across_episodes, sequences_of, within_episodes
 from navrep_data.datasets._rows import DiskRows, LoadedRows, select_episodes
-from navrep_data.errors import ConfigError
+from navrep_data.errors import ConfigError, one_line, whole_number
 from navrep_data.shards import DatasetFolder, Episodes
 
 Batch = dict[str, torch.Tensor]
@@ -174,9 +174,10 @@ class WindowDataset(Dataset[Batch]):
 
     def __getitem__(self, index: int | Sequence[int]) -> Batch:
         """Return one window, or a batch for a list of indices (from a batch sampler)."""
-        if isinstance(index, int | np.integer):
-            return {name: value[0] for name, value in self.batch([int(index)]).items()}
-        return self.batch(index)
+        number = whole_number(index)
+        if number is None:
+            return self.batch(index)  # type: ignore[arg-type]
+        return {name: value[0] for name, value in self.batch([number]).items()}
 
     def __getitems__(self, indices: Sequence[int]) -> list[Batch]:
         """Return several windows as a list; ``DataLoader`` calls this once per batch."""
@@ -192,9 +193,9 @@ class WindowDataset(Dataset[Batch]):
             ``sequence``, ``episode``, ``step`` (of the first row), ``rows`` (without padding), ``shard`` and
             ``row`` in it.
         """
-        n = len(self.table)
-        if not -n <= index < n:
-            raise IndexError(f"index {index} is out of range for {n} windows.")
+        n, number = len(self.table), whole_number(index)
+        if number is None or not -n <= number < n:
+            raise IndexError(f"index {one_line(repr(index))} is out of range for {n} windows.")
         t = self.table
         names = {
             "sequence": t.sequence,
@@ -204,7 +205,7 @@ class WindowDataset(Dataset[Batch]):
             "shard": t.shard,
             "row": t.start,
         }
-        return {name: int(values[index]) for name, values in names.items()}
+        return {name: int(values[number]) for name, values in names.items()}
 
     @property
     def provenance(self) -> dict[str, Any]:

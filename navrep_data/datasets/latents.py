@@ -23,7 +23,14 @@ from torch.utils.data import Dataset
 from navrep_data.datasets._batch import Assembler, BatchSpec
 from navrep_data.datasets._index import Ints, WindowTable, across_episodes, within_episodes
 from navrep_data.datasets._windows import Batch, check_choice, check_rows
-from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, SchemaVersionError, one_line
+from navrep_data.errors import (
+    ConfigError,
+    CorruptDataError,
+    DatasetNotFoundError,
+    SchemaVersionError,
+    one_line,
+    whole_number,
+)
 from navrep_data.io import atomic_write_bytes, json_bytes, read_json, reading, safe_join, sha256_bytes
 from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, SensorContract
 from navrep_data.shards import SPLITS, Episodes, shard_file
@@ -335,16 +342,19 @@ class LatentDataset(Dataset[Batch]):
         IndexError
             If an index is out of range.
         """
-        index = np.asarray(indices, np.int64)
+        index = np.asarray(indices)
         n = len(self.table)
-        if index.ndim != 1 or len(index) == 0 or index.min() < -n or index.max() >= n:
+        if index.ndim != 1 or len(index) == 0 or index.dtype.kind not in "iu" or index.min() < -n or index.max() >= n:
             raise IndexError(f"indices {one_line(repr(index))} do not fit {n} windows.")
-        chosen, table = np.mod(index, n), self.table
+        chosen, table = np.mod(index.astype(np.int64), n), self.table
         return self._assemble(self._rows, table.start[chosen], table.count[chosen], table.after[chosen])
 
     def __getitem__(self, index: int) -> Batch:
         """Return one window."""
-        return {name: value[0] for name, value in self.batch([index]).items()}
+        number = whole_number(index)
+        if number is None:
+            raise IndexError(f"index is {one_line(repr(index))}, expected a whole number.")
+        return {name: value[0] for name, value in self.batch([number]).items()}
 
     def __getitems__(self, indices: Sequence[int]) -> list[Batch]:
         """Return several windows as a list; ``DataLoader`` calls this once per batch."""

@@ -8,7 +8,7 @@ import torch
 from torch.utils.data import BatchSampler, DataLoader, RandomSampler, SequentialSampler
 
 from navrep_data.datasets._windows import WindowDataset
-from navrep_data.errors import ConfigError
+from navrep_data.errors import ConfigError, whole_number
 
 
 def make_loader(
@@ -51,9 +51,10 @@ def make_loader(
     ConfigError
         If the batch size is not at least 1.
     """
-    if isinstance(batch_size, bool) or not isinstance(batch_size, int) or batch_size < 1:
+    size = whole_number(batch_size)
+    if size is None or size < 1:
         raise ConfigError(f"batch_size is {batch_size!r}, expected a whole number of at least 1.")
     generator = torch.Generator().manual_seed(seed)
     order: Any = RandomSampler(dataset, generator=generator) if shuffle else SequentialSampler(dataset)
-    batches = BatchSampler(order, batch_size, drop_last)
+    batches = BatchSampler(order, size, drop_last)
     return DataLoader(dataset, batch_size=None, sampler=batches, num_workers=num_workers, **options)

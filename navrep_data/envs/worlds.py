@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from navrep_data.errors import ConfigError
+from navrep_data.errors import ConfigError, whole_number
 from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, Event
 from navrep_data.sim import SimConfig, Simulator, make_config, numpy_seed, scale_actions
 from navrep_data.sim import _layout as lay
@@ -249,6 +249,7 @@ def _has_numbers(env: str) -> bool:
 
 
 def _whole(name: str, value: Any, most: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value <= most:
+    number = whole_number(value)
+    if number is None or not 0 <= number <= most:
         raise ConfigError(f"{name} is {value!r}, expected a whole number from 0 to {most}.")
-    return int(value)
+    return number

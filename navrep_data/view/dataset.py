@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from navrep_data.errors import ConfigError, CorruptDataError
+from navrep_data.errors import ConfigError, CorruptDataError, whole_number
 from navrep_data.observations import RING_EDGES, scan_to_rings
 from navrep_data.schema import EVENT_NAMES, RINGS_SHAPE, SCAN_SCALE
 from navrep_data.shards import DatasetFolder, EpisodeWorld, Manifest, Worlds
@@ -121,7 +121,10 @@ def _choose(manifest: Manifest, sequences: Sequence[int] | None, root: Path) -> 
         raise ConfigError(f"{root} has no finished sequence yet; run its generate command again, then look at it.")
     if sequences is None:
         return there[:DEFAULT_SEQUENCES]
-    wanted = list(dict.fromkeys(sequences))
+    numbers = [whole_number(k) for k in sequences]
+    if None in numbers:
+        raise ConfigError(f"The sequences are {list(sequences)}, expected whole numbers.")
+    wanted = list(dict.fromkeys(k for k in numbers if k is not None))
     if len(wanted) > MAX_SEQUENCES:
         raise ConfigError(f"{len(wanted)} sequences were asked for, expected at most {MAX_SEQUENCES} in one page.")
     for k in wanted:

@@ -14,7 +14,7 @@ from dataset_files import identity, make_sequence, slow_windows, write_dataset
 from torch.utils.data import BatchSampler, DataLoader, RandomSampler
 
 from navrep_data.datasets import ScanDataset, SequenceDataset
-from navrep_data.errors import ConfigError, DatasetNotFoundError, UnknownNameError
+from navrep_data.errors import ConfigError, DatasetNotFoundError, UnknownNameError, whole_number
 from navrep_data.observations import fill_blind, rings_to_float, scan_to_rings
 
 # The tests ask for four workers wherever they run.
@@ -419,3 +419,28 @@ def test_bad_arguments(made, tmp_path):
 def test_the_maker_is_not_constant():
     a, b = (make_sequence(k, [20], ("scan", "action")) for k in (0, 1))
     assert (a["scan"] != b["scan"]).mean() > 0.9
+
+
+NUMBERS = [3, np.int64(3), np.uint8(3), np.array(3), torch.tensor(3), torch.tensor(3, dtype=torch.uint8)]
+NO_NUMBERS = [3.0, True, np.True_, np.float32(3), torch.tensor(3.0), torch.tensor(True), "3", None]
+
+
+@pytest.mark.parametrize("number", NUMBERS, ids=repr)
+def test_whatever_is_a_whole_number_is_an_index(made, number):
+    """Samplers and ``torch.randint`` hand out tensors without axes, numpy its own integers."""
+    dataset = SequenceDataset(made[0], lidar="1d", window=8)
+    expected = dataset[3]
+    for name, value in dataset[number].items():
+        torch.testing.assert_close(value, expected[name], rtol=0, atol=0)
+    assert dataset.info(number) == dataset.info(3)
+    assert len(dataset[[number, number]]["scan"]) == 2
+    assert whole_number(number) == 3
+
+
+@pytest.mark.parametrize("number", NO_NUMBERS, ids=repr)
+def test_what_is_none_is_refused(made, number):
+    dataset = SequenceDataset(made[0], lidar="1d", window=8)
+    for ask in (lambda: dataset[number], lambda: dataset[[number]], lambda: dataset.info(number)):
+        with pytest.raises(IndexError, match=r"expected a non-empty 1-D list of int|is out of range"):
+            ask()
+    assert whole_number(number) is None
