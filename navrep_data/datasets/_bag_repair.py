@@ -138,7 +138,7 @@ def _begins(path: Path, magic: bytes) -> bool:
 
 
 def _said(error: Exception) -> str:
-    return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+    return str(error).strip().rstrip(".") or type(error).__name__
 
 
 @contextlib.contextmanager

@@ -268,7 +268,7 @@ def make_sb3_vec(
     ((1085,), (4, 1085))
     """
     if lidar not in LIDARS:
-        raise ConfigError(f"lidar is {str(lidar)[:40]!r}, expected one of: scan, rings, 1d.")
+        raise ConfigError(f"lidar is {str(lidar)!r}, expected one of: scan, rings, 1d.")
     vector: Any = NavRepVectorEnv(n_envs, env, **settings)
     wrapper = LIDARS[lidar]
     if wrapper is not None:

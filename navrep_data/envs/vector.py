@@ -37,15 +37,14 @@ def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
     except ValueError:
         known = [known.value for known in AutoresetMode]
         raise ConfigError(
-            f"autoreset_mode is {str(mode)[:40]!r}, expected one of: {', '.join(known)}."
-            f"{did_you_mean(str(mode), known)}"
+            f"autoreset_mode is {str(mode)!r}, expected one of: {', '.join(known)}.{did_you_mean(str(mode), known)}"
         ) from None
 
 
 def _at_least_one(name: str, value: int | None) -> int | None:
     number = whole_number(value)
     if value is not None and (number is None or number < 1):
-        raise ConfigError(f"{name} is {str(value)[:40]}, expected a whole number of at least 1.")
+        raise ConfigError(f"{name} is {value}, expected a whole number of at least 1.")
     return number
 
 
