@@ -9,6 +9,7 @@ import typer
 
 from navrep_data.cli._common import print_json, say, say_err, show_progress
 from navrep_data.errors import ConfigError
+from navrep_data.registration import environment_of
 
 if TYPE_CHECKING:
     from navrep_data.train import Recipe, Trained
@@ -38,11 +39,37 @@ Device = Annotated[str, typer.Option("--device", help="cpu, cuda, cuda:1, ...")]
 Threads = Annotated[int | None, typer.Option("--threads", help="Threads of torch.", show_default="torch's")]
 Init = Annotated[str | None, typer.Option("--init", metavar="NAME|DIR", help="Start from these weights.")]
 From = Annotated[str | None, typer.Option("--from", metavar="DIR", help="Folder with the authors' files.")]
+
+
+def _list_settings(context: typer.Context, wanted: bool) -> None:
+    """Print the settings of a stage, or of all, and end; before flags that are missing are complained about."""
+    if not wanted:
+        return
+    from navrep_data.train.settings import STAGES, list_settings
+
+    stages = [context.info_name] if context.info_name in STAGES else list(STAGES)
+    for stage in stages:
+        if len(stages) > 1:
+            say(f"[{stage}]")
+        for line in list_settings(str(stage)):
+            say(line)
+    raise typer.Exit
+
+
+ListSettings = Annotated[
+    bool,
+    typer.Option("--list-settings", is_eager=True, callback=_list_settings, help="List what --set sets, and end."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Encoder = Annotated[
     str | None,
     typer.Option("--v", metavar="NAME|DIR", help="The V that encoded --data: also write V and M joined."),
 ]
+
+
+@train_app.callback()
+def train_command(list_settings: ListSettings = False) -> None:
+    """Train V, M, joint model, transformer or controllers."""
 
 
 @train_app.command("v")
@@ -51,6 +78,7 @@ def v_command(
     steps: Steps = None, epochs: Epochs = None, batch: Batch = None, seed: Seed = None, settings: Settings = None,
     resume: Resume = False, stop_after: StopAfter = None, device: Device = "cpu", threads: Threads = None,
     init: Init = None, source: From = None, as_json: Json = False,
+    list_settings: ListSettings = False,
 ) -> None:  # fmt: skip
     """Train V, the auto-encoder of lidar frames."""
     chosen = _recipe("v", lidar, original, recipe, settings, steps=steps, batch=batch, seed=seed)
@@ -65,6 +93,7 @@ def m_command(
     batch: Batch = None, seed: Seed = None, action: Action = None, settings: Settings = None, resume: Resume = False,
     stop_after: StopAfter = None, device: Device = "cpu", threads: Threads = None, init: Init = None,
     encoder: Encoder = None, source: From = None, as_json: Json = False,
+    list_settings: ListSettings = False,
 ) -> None:  # fmt: skip
     """Train M, the memory that predicts codes, on an encoded dataset."""
     from navrep_data.datasets.latents import LatentManifest
@@ -97,6 +126,7 @@ def joint_command(
     steps: Steps = None, epochs: Epochs = None, batch: Batch = None, seed: Seed = None, action: Action = None,
     settings: Settings = None, resume: Resume = False, stop_after: StopAfter = None, device: Device = "cpu",
     threads: Threads = None, init: Init = None, source: From = None, as_json: Json = False,
+    list_settings: ListSettings = False,
 ) -> None:  # fmt: skip
     """Train V and an LSTM together."""
     chosen = _recipe(
@@ -111,6 +141,7 @@ def transformer_command(
     steps: Steps = None, epochs: Epochs = None, batch: Batch = None, seed: Seed = None, action: Action = None,
     settings: Settings = None, resume: Resume = False, stop_after: StopAfter = None, device: Device = "cpu",
     threads: Threads = None, init: Init = None, source: From = None, as_json: Json = False,
+    list_settings: ListSettings = False,
 ) -> None:  # fmt: skip
     """Train V and a causal transformer together."""
     chosen = _recipe(
@@ -135,24 +166,9 @@ def _recipe(
             )
     else:
         recipe = (original_recipe if original else default_recipe)(model, lidar)
-    return recipe.replace(**changes).replace(**parse_settings(recipe.to_dict(), settings))
+    from navrep_data.train.settings import parse
 
-
-def parse_settings(known: dict[str, Any], settings: list[str] | None) -> dict[str, Any]:
-    """Return NAME=VALUE pairs as values of the types that `known` has."""
-    from navrep_data.errors import did_you_mean
-
-    found: dict[str, Any] = {}
-    for pair in settings or ():
-        name, equals, text = pair.partition("=")
-        if not equals or name not in known:
-            raise ConfigError(f"--set {pair!r} is no setting.{did_you_mean(name, known)} Known: {', '.join(known)}.")
-        kind = type(known[name])
-        try:
-            found[name] = {"true": True, "false": False}[text.lower()] if kind is bool else kind(text)
-        except (KeyError, ValueError):
-            raise ConfigError(f"--set {name}={text} is no {kind.__name__}, as {name} is.") from None
-    return found
+    return recipe.replace(**changes).replace(**parse(settings or (), recipe.to_dict(), model))
 
 
 def use_threads(threads: int | None) -> None:
@@ -227,6 +243,10 @@ Validate = Annotated[
 PpoSteps = Annotated[
     int | None, typer.Option("--steps", help="Steps of all worlds together.", show_default="the recipe's")
 ]
+Env = Annotated[
+    str | None,
+    typer.Option("--env", help="Environment to train in, such as navrep-train or map.", show_default="navrep-train"),
+]
 Worlds = Annotated[int | None, typer.Option("--worlds", help="Worlds stepped at once.", show_default="the recipe's")]
 PpoBatch = Annotated[int | None, typer.Option("--batch", help="Rows per gradient step.", show_default="the recipe's")]
 
@@ -235,11 +255,12 @@ PpoBatch = Annotated[int | None, typer.Option("--batch", help="Rows per gradient
 def controller_command(
     world_model: Annotated[str, typer.Option("--world-model", metavar="NAME|DIR", help="What it sees through.")],
     out: Out,
-    features: Annotated[str, typer.Option("--features", help="z, h or zh.")] = "z",
+    features: Annotated[str, typer.Option("--features", help="z, h or zh.")] = "z", env: Env = None,
     original: Original = False, steps: PpoSteps = None, worlds: Worlds = None, batch: PpoBatch = None,
     seed: Seed = None, validate_every: Validate = None, settings: Settings = None, init: Init = None,
     resume: Resume = False, stop_after: StopAfter = None, device: Device = "cpu", threads: Threads = None,
     source: From = None, as_json: Json = False,
+    list_settings: ListSettings = False,
 ) -> None:  # fmt: skip
     """Train a controller by PPO on the codes of a frozen world model."""
     from navrep_data.train.encode import vae_of
@@ -251,7 +272,8 @@ def controller_command(
         raise ConfigError(f"--features is {features!r}, expected z, h or zh.")
     model = load_any_model(world_model, source)
     lidar = vae_of(model, world_model).config.lidar
-    changes = {"steps": steps, "worlds": worlds, "batch": batch, "seed": seed, "validate_every": validate_every}
+    changes = {"steps": steps, "worlds": worlds, "batch": batch, "seed": seed, "validate_every": validate_every,
+               "env": None if env is None else environment_of(env)}  # fmt: skip
     _train_controller(
         features, lidar, original, settings, changes, out, model, world_model, init, resume, stop_after, device, source,
         as_json,
@@ -260,15 +282,17 @@ def controller_command(
 
 @train_app.command("e2e")
 def e2e_command(
-    out: Out, lidar: Lidar = "rings", original: Original = False, steps: PpoSteps = None, worlds: Worlds = None,
-    batch: PpoBatch = None, seed: Seed = None, validate_every: Validate = None, settings: Settings = None,
-    init: Init = None, resume: Resume = False, stop_after: StopAfter = None, device: Device = "cpu",
-    threads: Threads = None, source: From = None, as_json: Json = False,
+    out: Out, lidar: Lidar = "rings", env: Env = None, original: Original = False, steps: PpoSteps = None,
+    worlds: Worlds = None, batch: PpoBatch = None, seed: Seed = None, validate_every: Validate = None,
+    settings: Settings = None, init: Init = None, resume: Resume = False, stop_after: StopAfter = None,
+    device: Device = "cpu", threads: Threads = None, source: From = None, as_json: Json = False,
+    list_settings: ListSettings = False,
 ) -> None:  # fmt: skip
     """Train an end-to-end network by PPO."""
     use_threads(threads)
     check_device(device)
-    changes = {"steps": steps, "worlds": worlds, "batch": batch, "seed": seed, "validate_every": validate_every}
+    changes = {"steps": steps, "worlds": worlds, "batch": batch, "seed": seed, "validate_every": validate_every,
+               "env": None if env is None else environment_of(env)}  # fmt: skip
     _train_controller(
         "e2e", lidar, original, settings, changes, out, None, "", init, resume, stop_after, device, source, as_json
     )
@@ -281,6 +305,7 @@ def _train_controller(
 ) -> None:  # fmt: skip
     from navrep_data.models import ModularWorldModel
     from navrep_data.train import default_controller_recipe, original_controller_recipe, train_controller
+    from navrep_data.train.settings import parse, sim_settings
     from navrep_data.zoo.local import load_any_model
 
     if original:
@@ -289,7 +314,11 @@ def _train_controller(
         recipe = default_controller_recipe(features, lidar)
     # --set has the last word
     given = {name: value for name, value in changes.items() if value is not None}
-    recipe = recipe.fit_batch(**{**given, **parse_settings(recipe.to_dict(), settings)})
+    worlds = sim_settings()
+    found = parse(settings or (), {**worlds, **recipe.to_dict()}, "e2e" if features == "e2e" else "controller")
+    sim = {name: value for name, value in found.items() if name in worlds}
+    own = {name: value for name, value in found.items() if name not in worlds}
+    recipe = recipe.fit_batch(**{**given, **own, "sim": sim})
     start = None if init is None else load_any_model(init, source)
     done = train_controller(
         recipe, out, model=model, model_name=name, init=start, resume=resume, stop_after=stop_after, device=device,

@@ -54,7 +54,9 @@ def make_loader(
     size = whole_number(batch_size)
     if size is None or size < 1:
         raise ConfigError(f"batch_size is {batch_size!r}, expected a whole number of at least 1.")
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator(device="cpu").manual_seed(seed)
     order: Any = RandomSampler(dataset, generator=generator) if shuffle else SequentialSampler(dataset)
     batches = BatchSampler(order, size, drop_last)
+    # which workers are seeded from; by default it draws from the global one
+    options.setdefault("generator", torch.Generator(device="cpu").manual_seed(seed))
     return DataLoader(dataset, batch_size=None, sampler=batches, num_workers=num_workers, **options)

@@ -67,6 +67,7 @@ def play(
     env: gymnasium.Env[Any, Any],
     *,
     seed: int | None = None,
+    options: dict[str, Any] | None = None,
     episodes: int | None = None,
     speed: float = 1.0,
     report: Callable[[str], None] = print,
@@ -79,6 +80,8 @@ def play(
         A NavRep environment with one robot, wrapped or not.
     seed : int, optional
         For the first ``env.reset``.
+    options : dict, optional
+        For the first ``env.reset``; ``start`` and ``goal`` for all.
     episodes : int, optional
         End after so many; without it, at Escape.
     speed : float
@@ -102,7 +105,7 @@ def play(
     keyboard = Keyboard()
     window = Window("navrep-data play", keyboard.on_key, lambda: setattr(keyboard, "quit", True))
     try:
-        return drive(env, keyboard, window, seed=seed, episodes=episodes, speed=speed, report=report)
+        return drive(env, keyboard, window, seed=seed, options=options, episodes=episodes, speed=speed, report=report)
     finally:
         window.close()
 
@@ -113,6 +116,7 @@ def drive(
     window: Window,
     *,
     seed: int | None = None,
+    options: dict[str, Any] | None = None,
     episodes: int | None = None,
     speed: float = 1.0,
     report: Callable[[str], None] = print,
@@ -124,7 +128,8 @@ def drive(
     if not 0.01 <= speed <= 100.0:
         raise ConfigError(f"speed is {speed!r}, expected a number from 0.01 to 100.")
     endings: list[str] = []
-    env.reset(seed=seed)
+    places = {name: place for name, place in (options or {}).items() if name in ("start", "goal")} or None
+    env.reset(seed=seed, options=options)
     due = time.monotonic()
     while not keyboard.quit and (episodes is None or len(endings) < episodes):
         _, _, terminated, truncated, info = env.step(keyboard.action())
@@ -134,7 +139,7 @@ def drive(
             report(f"episode {len(endings)}: {info['event']}")
         if terminated or truncated or keyboard.restart:
             keyboard.restart = False
-            env.reset()
+            env.reset(options=places)
         due = max(due + world.config.sensor.dt / speed, time.monotonic())
         window.wait(due - time.monotonic())
     return endings

@@ -125,7 +125,9 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         seed : int, optional
             Which one; see the class's notes.
         options : dict, optional
-            ``{"episode": k}``: number k of the environment's numbered episodes.
+            ``{"episode": k}``: number k of the environment's numbered episodes. ``{"start": (x, y) or (x, y, theta),
+            "goal": (x, y)}``, either or both: where the robot starts and wants to go [m, rad], world frame, in the
+            world that is drawn otherwise; refused where it is not free. One robot; no goals in scenarios.
 
         Returns
         -------
@@ -140,6 +142,7 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             If a world could not be drawn.
         """
         super().reset(seed=seed)
+        self._running = False
         self._worlds.choose([seed], options, self.np_random)
         self._worlds.restart(_ONE)
         self._running = True

@@ -146,7 +146,9 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         seed : int or sequence of int or None, optional
             World i gets ``seed + i``, or ``seed[i]``.
         options : dict, optional
-            ``{"episode": k}``: world i plays number k + i; ``{"reset_mask": mask}``: ndarray of shape (N,), bool.
+            ``{"episode": k}``: world i plays number k + i; ``{"reset_mask": mask}``: ndarray of shape (N,), bool;
+            ``{"start": ..., "goal": ...}``: as for :class:`NavRepEnv`, one for all worlds or a row for each. They hold
+            for this reset, not for episodes that follow by themselves.
 
         Returns
         -------

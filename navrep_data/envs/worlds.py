@@ -117,6 +117,7 @@ class Worlds:
         self._fresh = np.full(n, not listed)
         self._restarts = np.zeros(n, np.bool_)  # streams that start anew at the next reset, with these seeds
         self._streams = np.zeros(n, np.int64)
+        self._places: tuple[F64, F64] | None = None  # starts and goals of the next reset
         self.seeds = np.zeros(n, np.int64)  # numpy seeds of the present episodes
         self.events = np.zeros(n, np.uint8)
 
@@ -136,14 +137,19 @@ class Worlds:
         seeds : sequence of int or None, one per world
             numpy seeds in environments with numbered episodes, streams in the others; None = go on.
         options : mapping, optional
-            ``{"episode": k}``: world i plays number k + i.
+            ``{"episode": k}``: world i plays number k + i; ``{"start": ..., "goal": ...}``: see :meth:`restart`.
         random : numpy.random.Generator
             Seeds what nobody has seeded.
         """
-        known = {"episode", "reset_mask"}
+        known = {"episode", "goal", "reset_mask", "start"}
         unknown = sorted(set(options or {}) - known)
         if unknown:
             raise ConfigError(f"Unknown reset option {unknown[0]!r}, expected one of: {', '.join(sorted(known))}.")
+        given_places = (options or {}).get("start"), (options or {}).get("goal")
+        self._places = None
+        if any(place is not None for place in given_places):
+            starts, goals = given_places
+            self._places = _places("start", starts, self.n, (2, 3)), _places("goal", goals, self.n, (2,))
         if options and options.get("episode") is not None:
             self._next = self._number(options["episode"]) + np.arange(self.n)
             self._plain[:] = self._fresh[:] = False
@@ -167,7 +173,14 @@ class Worlds:
             self._restarts |= chosen
 
     def restart(self, mask: Mask) -> None:
-        """Start the next episode in the worlds of `mask`."""
+        """Start the next episode in the worlds of `mask`, with start and goal that :meth:`choose` was told of."""
+        places, self._places = self._places, None
+        chosen = mask.copy()
+        self._draw(mask)
+        if places is not None:
+            self.sim.place(*places, chosen)
+
+    def _draw(self, mask: Mask) -> None:
         self.events[mask] = 0
         if self.numbered:
             self._restart_numbered(mask)
@@ -246,6 +259,24 @@ def _has_numbers(env: str) -> bool:
     except ConfigError:
         return False
     return True
+
+
+def _places(name: str, value: Any, n: int, sizes: tuple[int, ...]) -> F64:
+    """Return (n, largest size) of one place for all worlds, one each, or None; NaN = as drawn."""
+    out = np.full((n, max(sizes)), np.nan)
+    if value is None:
+        return out
+    try:
+        rows = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        rows = np.zeros(0)
+    if rows.shape[-1:] and rows.shape[-1] in sizes and rows.shape[:-1] in ((), (n,)) and np.isfinite(rows).all():
+        out[:, : rows.shape[-1]] = rows
+        return out
+    wanted = "x, y [m], or with a heading [rad]" if len(sizes) > 1 else "x, y [m]"
+    raise ConfigError(
+        f"{name} is {str(value)[:60]}, expected finite {wanted}, for all worlds or a row for each of {n}."
+    )
 
 
 def _whole(name: str, value: Any, most: int) -> int:

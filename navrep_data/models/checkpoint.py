@@ -6,7 +6,8 @@ and ``NAME.json``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -191,6 +192,32 @@ def read_config(path: Path | str) -> dict[str, Any]:
     return found
 
 
+@contextlib.contextmanager
+def single_precision() -> Iterator[None]:
+    """Make float32 the default of torch for a while, whatever it is."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+@contextlib.contextmanager
+def building() -> Iterator[None]:
+    """Build networks the same whatever torch is set to: float32, on the CPU, with gradients, and without a trace.
+
+    Weights that are about to be overwritten are drawn first; the global generator is left as it was. Loading goes
+    through this; networks that are about to be trained do not, since a training's seed decides their weights.
+    """
+    with (
+        single_precision(), torch.random.fork_rng(devices=[]), torch.device("cpu"), torch.inference_mode(False),
+        torch.enable_grad(),
+    ):  # fmt: skip
+        yield
+
+
+@building()
 def load(path: Path | str) -> nn.Module:
     """Read a network written by :func:`save`, in eval mode, on the CPU.
 

@@ -47,7 +47,7 @@ class ActorCritic(nn.Module):
         self.mean = nn.Linear(n_hidden, N_ACTIONS)
         self.value = nn.Linear(n_hidden, 1)
         self.q = nn.Linear(n_hidden, N_ACTIONS)
-        self.logstd = nn.Parameter(torch.zeros(N_ACTIONS))
+        self.logstd = nn.Parameter(torch.zeros(N_ACTIONS, dtype=torch.float32))
 
     def features(self, inputs: Tensor) -> Tensor:
         """Return what the two perceptrons take; here the inputs themselves."""

@@ -76,7 +76,7 @@ class JointStream:
     def __init__(self, model: JointWorldModel, batch_size: int) -> None:
         config, device = model.config, model.device_of()
         self.model = model
-        self.state = torch.zeros(2, config.n_layers, batch_size, config.h_size, device=device)
+        self.state = torch.zeros(2, config.n_layers, batch_size, config.h_size, dtype=torch.float32, device=device)
         self.count = torch.zeros(batch_size, dtype=torch.long, device=device)
 
     def step(self, mu: Tensor, logvar: Tensor, goal: Tensor, action: Tensor) -> Tensor:

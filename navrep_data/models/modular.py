@@ -168,7 +168,7 @@ class ModularStream:
 
     def __init__(self, model: ModularWorldModel, batch_size: int) -> None:
         self.model = model
-        self.state = torch.zeros(2, 1, batch_size, model.config.h_size, device=model.device_of())
+        self.state = torch.zeros(2, 1, batch_size, model.config.h_size, dtype=torch.float32, device=model.device_of())
 
     def step(self, mu: Tensor, logvar: Tensor, goal: Tensor, action: Tensor) -> Tensor:
         """Feed one row per episode; see :class:`Stream`."""

@@ -34,7 +34,7 @@ def can_quantize() -> bool:
         probe = nn.Conv2d(1, 32, 4, stride=2)
         layer = _Layer(probe, 1 / _LEVELS, None)
         found = layer(torch.full((2, 1, 8, 8), 100, dtype=torch.uint8).to(memory_format=torch.channels_last))
-        exact = probe(torch.full((2, 1, 8, 8), 100 / _LEVELS)).relu()
+        exact = probe(torch.full((2, 1, 8, 8), 100 / _LEVELS, dtype=torch.float32)).relu()
     except (AttributeError, RuntimeError, TypeError):
         return False
     return torch.allclose(found, exact, atol=0.02)
@@ -69,7 +69,7 @@ class _FloatLayer:
     def __init__(self, conv: nn.Conv2d, out_scale: float) -> None:
         # the scale is in the weights, and half a step in the bias: bytes are cut, not rounded
         self.weight = (conv.weight.detach() / out_scale).contiguous(memory_format=torch.channels_last)
-        bias = torch.zeros(len(conv.weight)) if conv.bias is None else conv.bias.detach()
+        bias = torch.zeros(len(conv.weight), dtype=torch.float32) if conv.bias is None else conv.bias.detach()
         self.bias = bias / out_scale + 0.5
         self.stride = conv.stride
 

@@ -107,7 +107,7 @@ class TransformerWorldModel(WorldModel):
         super().__init__()
         self.config = config
         n = config.z_size
-        self.pos_emb = nn.Parameter(torch.zeros(1, config.context, n))
+        self.pos_emb = nn.Parameter(torch.zeros(1, config.context, n, dtype=torch.float32))
         self.vae = VAE(self.vae_config())
         self.action_emb = nn.Linear(3, n)
         self.state_emb = nn.Linear(2, n)
@@ -159,9 +159,9 @@ class TransformerStream:
         c, device = model.config, model.device_of()
         shape = (2, c.n_blocks, batch_size, c.n_heads, c.context, c.z_size // c.n_heads)
         self.model = model
-        self.cache = torch.zeros(shape, device=device)
+        self.cache = torch.zeros(shape, dtype=torch.float32, device=device)
         self.count = torch.zeros(batch_size, dtype=torch.long, device=device)
-        self.h = torch.zeros(batch_size, c.z_size, device=device)
+        self.h = torch.zeros(batch_size, c.z_size, dtype=torch.float32, device=device)
 
     def step(self, mu: Tensor, logvar: Tensor, goal: Tensor, action: Tensor) -> Tensor:
         """Feed one row per episode; see :class:`Stream`."""

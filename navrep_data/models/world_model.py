@@ -254,7 +254,7 @@ class WindowStream:
     def __init__(self, model: WorldModel, batch_size: int, newest: bool, noise: Noise | None) -> None:
         device = model.device_of()
         self.model, self.newest, self.noise = model, newest, noise
-        self.rows = torch.zeros(batch_size, CONTEXT, 2 * model.z_size + 5, device=device)
+        self.rows = torch.zeros(batch_size, CONTEXT, 2 * model.z_size + 5, dtype=torch.float32, device=device)
         self.count = torch.zeros(batch_size, dtype=torch.long, device=device)
 
     def step(self, mu: Tensor, logvar: Tensor, goal: Tensor, action: Tensor) -> Tensor:

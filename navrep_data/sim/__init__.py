@@ -1,6 +1,6 @@
 """NavRepSim: worlds, humans, lidar and robot, for many independent worlds at once."""
 
-from navrep_data.sim.actions import robot_contract, scale_actions
+from navrep_data.sim.actions import robot_contract, scale_actions, velocity_commands
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.gridmap import GridMap
 from navrep_data.sim.map_rollout import CallableMapRollout, ScriptedMapRollout
@@ -54,5 +54,6 @@ __all__ = [
     "robot_contract",
     "scale_actions",
     "scenario_names",
+    "velocity_commands",
     "warm_up",
 ]

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from navrep_data.errors import ConfigError
 from navrep_data.schema import ACTION_SIZE, TRAINING_RADIUS, RobotContract
+from navrep_data.sim._rollout import STEER_LIMIT
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.map_tables import RADIUS
 
@@ -60,3 +61,28 @@ def scale_actions(config: SimConfig, actions: ArrayLike) -> NDArray[np.float64]:
         shares[..., :2] /= np.maximum(length, 1.0)
     commands: NDArray[np.float64] = shares * np.asarray(config.max_velocity)
     return commands
+
+
+def velocity_commands(config: SimConfig, velocities: ArrayLike) -> NDArray[np.float64]:
+    """Return the commands that bring a robot of any drive nearest to the velocities that a controller wants.
+
+    Parameters
+    ----------
+    config : SimConfig
+        Its `drive`, `max_velocity` and time step.
+    velocities : array_like of shape (..., 2)
+        Shares of the largest vx and vy, robot frame.
+
+    Returns
+    -------
+    ndarray of shape (..., 3), float64
+        vx, vy [m/s], omega [rad/s]. Holonomic: as :func:`scale_actions`. Differential: the robot turns towards where it
+        wants to go, by at most 1 rad/s, and goes forward by the part of the velocity that lies ahead, as scripted
+        policies do.
+    """
+    wanted = scale_actions(config, velocities)
+    if config.drive != "differential":
+        return wanted
+    turn = np.arctan2(wanted[..., 1], wanted[..., 0]) / config.sensor.dt
+    limited = turn.clip(-STEER_LIMIT, STEER_LIMIT)
+    return np.stack([wanted[..., 0].clip(0.0), np.zeros_like(turn), limited], axis=-1)

@@ -12,6 +12,7 @@ from navrep_data.sim import _ian_layout as il
 from navrep_data.sim import _layout as lay
 from navrep_data.sim._ellipse import ELLIPSE_COLUMNS
 from navrep_data.sim._ian_contact import swept_cells
+from navrep_data.sim._ian_place import place_on_map
 from navrep_data.sim._orca import make_orca_work
 from navrep_data.sim.config import SimConfig, keeps_speed_limit, kernel_flags, kernel_params
 from navrep_data.sim.lidar import ray_directions
@@ -182,6 +183,11 @@ class MapWorlds:
     def robot_states(self, mask: NDArray[np.bool_], states: F32) -> None:
         """Fill robot states (W R, 5) in the worlds of `mask` (W,)."""
         _ian_batch.observe_map_states(mask, self.arrays.worlds, self.arrays.rules, states)
+
+    def place(self, world: int, where: F64) -> None:
+        """Put the robot of a world at x, y [m], heading [rad] with the goal x, y [m], right after a reset."""
+        w = self.arrays.worlds
+        place_on_map(w.agents[world], w.walkers[world], w.place[world], w.own_field[world], self.data.tables, *where)
 
     def ways_ahead(self) -> F64:
         """Return a point about a metre ahead of each first robot on its way to the goal, (W, 2) [m]."""

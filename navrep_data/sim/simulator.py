@@ -25,6 +25,8 @@ from navrep_data.sim.map_worlds import MapWorlds
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 
+# What was drawn may touch an obstacle to within rounding, or by a cell's corner [m].
+_TOUCHING = 1e-6
 MAX_SEED = 2**63 - 1
 MAX_NUMPY_SEED = 2**32 - 1
 
@@ -42,6 +44,42 @@ def no_world(config: SimConfig, which: str = "") -> SimulationError:
         f"No world {which}with humans={config.humans}, obstacles={config.obstacles} could be drawn: no free place, "
         f"or more than {lay.MAX_OBSTACLE_EDGES} obstacle edges; ask for fewer of both."
     )
+
+
+def _rows(name: str, values: ArrayLike, n: int, size: int) -> F64:
+    rows = np.array(values, np.float64)
+    if rows.shape != (n, size) or np.isinf(rows).any():
+        raise ConfigError(f"{name} have shape {rows.shape}, expected ({n}, {size}) finite numbers, or NaN.")
+    return rows
+
+
+def check_place(simulator: Simulator, world: int, where: F64) -> None:
+    """Raise ConfigError unless the robot of a world can start and arrive there: x, y, heading, goal x, goal y."""
+    state, config = simulator.state(world), simulator.config
+    radius = float(state.robot[5])
+    if state.step > 0:
+        raise ConfigError(f"World {world} has had {state.step} steps, expected none: robots are placed after a reset.")
+    if config.scenarios and (where[3:] != state.robot[3:5]).any():
+        raise ConfigError(
+            "A goal was given, but scenarios have their own: give a start only, or an environment on maps without "
+            "scenarios, such as map."
+        )
+    for name, (x, y) in (("start", where[:2]), ("goal", where[3:])):
+        gap = float(simulator.clearance([[x, y]], world)[0])
+        if not gap >= radius - _TOUCHING:
+            raise ConfigError(
+                f"The {name} ({x:g}, {y:g}) has {gap:.2f} m to the next obstacle, expected at least the robot's radius "
+                f"of {radius:.2f} m (negative: inside one, or outside of the world): choose a free place."
+            )
+    near = np.hypot(*(state.humans[:, :2] - where[:2]).T) - state.humans[:, 7] - radius
+    if len(near) and near.min() < 0.0:
+        raise ConfigError(
+            f"The start ({where[0]:g}, {where[1]:g}) overlaps a human by {-near.min():.2f} m: choose a free place, or "
+            "another seed."
+        )
+    way, reach = float(np.hypot(*(where[3:] - where[:2]))), config.goal_radius or radius
+    if way <= reach:
+        raise ConfigError(f"The goal is {way:.2f} m from the start, expected more than {reach:.2f} m, its reach.")
 
 
 class WorldArrays:
@@ -270,6 +308,39 @@ class Simulator:
         streams = np.zeros((self.n_worlds, lay.RNG_WORDS), np.uint64)
         _batch.seed_legacy(streams, np.where(chosen, seeds, 0).astype(np.uint64), chosen)
         return streams
+
+    def place(self, starts: ArrayLike, goals: ArrayLike, mask: ArrayLike | None = None) -> None:
+        """Put robots and their goals elsewhere, right after a reset; everything else stays as it was drawn.
+
+        Parameters
+        ----------
+        starts : array_like of shape (W, 3)
+            x, y [m], heading [rad], world frame; NaN = as drawn (x and y together).
+        goals : array_like of shape (W, 2)
+            x, y [m], world frame; NaN = as drawn.
+        mask : array_like of shape (W,), optional
+            Which worlds.
+
+        Raises
+        ------
+        ConfigError
+            If there are several robots, a shape is wrong, an episode has had a step, a robot would not be free of
+            obstacles and humans at its start or of obstacles at its goal, or would have arrived already; or if a
+            scenario, which has its goals worked out beforehand, is given another one. No robot is moved then.
+        """
+        chosen = self._mask(mask)
+        where = np.concatenate([_rows("starts", starts, self.n_worlds, 3), _rows("goals", goals, self.n_worlds, 2)], 1)
+        if self.config.robots > 1:
+            raise ConfigError(f"robots is {self.config.robots}, expected 1: starts and goals are given for one robot.")
+        columns = [lay.A_X, lay.A_Y, lay.A_HEADING, lay.A_GX, lay.A_GY]
+        where = np.where(np.isnan(where), self.arrays.agents[:, 0, columns], where)
+        for w in np.flatnonzero(chosen):
+            check_place(self, int(w), where[w])
+        for w in np.flatnonzero(chosen):
+            if self.maps is not None:
+                self.maps.place(int(w), where[w])
+            else:
+                self.arrays.agents[w, 0, columns] = where[w]
 
     def restart(self, seeds: ArrayLike, mask: ArrayLike | None = None) -> None:
         """Give worlds new streams, forget their episodes, and start the first one.

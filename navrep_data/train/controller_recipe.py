@@ -9,8 +9,10 @@ from typing import Any
 from navrep_data.errors import ConfigError
 from navrep_data.models.controllers import LEAST_STD, MOST_STD
 from navrep_data.sim import SimConfig, make_config
+from navrep_data.train.settings import environment_of_settings
 from navrep_data.zoo.policy import FEATURES
 
+DEFAULT_ENV = "navrep-train"
 VALIDATION_SEEDS = range(5000, 5100)
 """Episodes that selection looks at: never those of the test suite, 1000 to 1199."""
 AUTHORS_SEEDS = range(1000, 1100)
@@ -50,8 +52,14 @@ class ControllerRecipe:
         Units per layer.
     max_speed : float
         Longest velocity commanded [m/s]; 0 = no limit beyond [-1, 1] on each axis.
+    env : str
+        Environment to train in.
     physics : str
-        Of the training worlds. Validation is in original physics, as the benchmark.
+        Of the training worlds.
+    sim : dict
+        Other settings of the training worlds, as :func:`navrep_data.train.settings.sim_settings` names them. Without
+        any in ``navrep-train``, validation plays navrep-test in original physics, as the benchmark; otherwise the
+        environment itself, with a constant curriculum.
     reward_scale : float
         Factor on rewards.
     progress : float
@@ -105,6 +113,9 @@ class ControllerRecipe:
     refit: bool = False
     validate_every: int = 100_000
     seed: int = 0
+    # left out of to_dict at their defaults: recipes written before they came stay as they are
+    env: str = DEFAULT_ENV
+    sim: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check what the parts it is passed to do not check."""
@@ -129,6 +140,8 @@ class ControllerRecipe:
             raise ConfigError(
                 f"batch is {self.batch}, expected a divisor of worlds x rollout = {self.worlds * self.rollout}."
             )
+        if environment(self).robots > 1:
+            raise ConfigError(f"robots is {environment(self).robots}, expected 1: controllers drive one robot.")
 
     def replace(self, **changes: Any) -> ControllerRecipe:
         """Return a copy with some fields changed; None means unchanged."""
@@ -143,8 +156,9 @@ class ControllerRecipe:
         return self.replace(**changes)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as plain JSON values."""
-        return dataclasses.asdict(self)
+        """Return the fields as plain JSON values, environment and its settings only where they were chosen."""
+        values = dataclasses.asdict(self)
+        return {n: v for n, v in values.items() if n not in ("env", "sim") or v not in (DEFAULT_ENV, {})}
 
 
 def default_controller_recipe(features: str, lidar: str) -> ControllerRecipe:
@@ -165,10 +179,13 @@ def original_controller_recipe(features: str, lidar: str, modular: bool = False)
 
 
 def environment(recipe: ControllerRecipe) -> SimConfig:
-    """Return the training environment: each world adapts its own difficulty."""
-    return make_config("navrep-train", physics=recipe.physics, curriculum="adaptive")
+    """Return the training environment; in ``navrep-train`` each world adapts its own difficulty."""
+    adaptive = {"curriculum": "adaptive"} if recipe.env == DEFAULT_ENV else {}
+    return environment_of_settings(recipe.env, recipe.physics, {**adaptive, **recipe.sim})
 
 
-def validation_environment() -> SimConfig:
-    """Return the environment that validation plays: that of the test suite, with other episodes."""
-    return make_config("navrep-test", physics="original")
+def validation_environment(recipe: ControllerRecipe | None = None) -> SimConfig:
+    """Return what validation plays, episodes by numpy seed: the test suite's environment, or the recipe's own."""
+    if recipe is None or (recipe.env == DEFAULT_ENV and not recipe.sim):
+        return make_config("navrep-test", physics="original")
+    return environment(recipe).replace(curriculum="constant")

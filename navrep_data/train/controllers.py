@@ -75,6 +75,7 @@ class TrainedController:
     held_out: float | None
 
 
+@checkpoint.single_precision()
 def train_controller(
     recipe: ControllerRecipe,
     out: Path | str,
@@ -188,7 +189,7 @@ class _Run(BaseCallback):
         self.at = state.Progress()
         done = state.read_step(folder) if folder is not None else 0
         self.worlds = make_worlds(recipe, network, model, self.encoder, _stream(recipe, done))
-        if recipe.easy_start:
+        if recipe.easy_start and self.worlds.groups[0].config.curriculum == "adaptive":
             self.worlds.set_difficulty(np.zeros_like(self.worlds.difficulty()))
         self.ppo = make_ppo(recipe, self.worlds, network, device)
         if folder is not None:
@@ -372,18 +373,19 @@ class _Run(BaseCallback):
         network = self.network if network is None else network
         exact = self.recipe.replace(precision="float32")
         policy = make_policy(exact, network, self.policy_now.world_model or self.policy_now.vae)
-        ended = play(policy, validation_environment(), seeds)
+        ended = play(policy, validation_environment(self.recipe), seeds)
         return sum(event == Event.GOAL for event in ended) / len(ended)
 
     def _metadata(self) -> dict[str, Any]:
         seeds = AUTHORS_SEEDS if self.recipe.original else VALIDATION_SEEDS
+        where = validation_environment(self.recipe)
         return {
             "trained_by": f"navrep-data {__version__}",
             "note": "Retrained by navrep-data; not the authors' checkpoint.",
             "recipe": self.recipe.to_dict(),
             "world_model": self.model_name,
             "environment": environment(self.recipe).to_dict(),
-            "selected_on": f"navrep-test, original physics, numpy seeds {seeds.start} to {seeds.stop - 1}",
+            "selected_on": f"{where.env}, {where.physics} physics, numpy seeds {seeds.start} to {seeds.stop - 1}",
             "step": self.at.step,
             "seconds": round(self.at.seconds, 1),
             "machine": machine(self.ppo.device),

@@ -25,6 +25,7 @@ from navrep_data.train.ppo_policy import FastExtractor
 from navrep_data.train.worlds import TrainingWorlds, WorldGroups
 from navrep_data.zoo.policy import Policy
 from navrep_data.zoo.sb3 import BoundedPolicy
+from navrep_data.zoo.sb3_worlds import eyes
 
 _CODES = 0.2
 _WORTH_A_GROUP = 64
@@ -77,7 +78,8 @@ def make_encoder(recipe: ControllerRecipe, model: Any) -> QuantizedEncoder | Non
     """
     if recipe.features == "e2e" or recipe.precision != "int8" or not can_quantize():
         return None
-    simulator = Simulator(environment(recipe), _CALIBRATION, seed=0)
+    config = environment(recipe)
+    see, simulator = eyes(config), Simulator(config, _CALIBRATION, seed=0)
     simulator.reset()
     draw = np.random.default_rng(0)
     for _ in range(_CALIBRATION_STEPS):
@@ -86,7 +88,7 @@ def make_encoder(recipe: ControllerRecipe, model: Any) -> QuantizedEncoder | Non
         _, events = simulator.step(commands)
         simulator.reset(events != 0)
     return QuantizedEncoder(
-        vae_of(model, "The world model"), observation_from_scan(simulator.observe()[0], recipe.lidar)
+        vae_of(model, "The world model"), observation_from_scan(see(simulator.observe()[0]), recipe.lidar)
     )
 
 

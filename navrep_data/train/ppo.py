@@ -54,7 +54,7 @@ class GroupedPPO(PPO):
         # drawn for all at once, so that a world's noise does not depend on the groups
         noise = torch.randn(n_rollout_steps, *rollout_buffer.actions.shape[1:])
         obs, starts = np.array(self._last_obs), np.array(self._last_episode_starts)
-        values = torch.zeros(env.num_envs)
+        values = torch.zeros(env.num_envs, dtype=torch.float32)
 
         def roll(group: TrainingWorlds, worlds: slice) -> None:
             obs[worlds], starts[worlds], values[worlds] = self._roll(

@@ -22,6 +22,7 @@ from navrep_data.models.observation import observation_from_scan
 from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE
 from navrep_data.sim import SimConfig, Simulator
 from navrep_data.zoo.policy import Policy
+from navrep_data.zoo.sb3_worlds import eyes
 
 _WORLDS = 512
 _ROUNDS, _STEPS_PER_ROUND = 20, 12
@@ -42,7 +43,7 @@ def random_scans(config: SimConfig, n_worlds: int, n_rounds: int, n_steps: int) 
             commands[:, :2] = draw.uniform(-1.0, 1.0, (n_worlds, 2))
             _, events = simulator.step(commands)
             simulator.reset(events != 0)
-        scans.append(simulator.observe()[0].copy())
+        scans.append(eyes(config)(simulator.observe()[0]).copy())
     return np.concatenate(scans)
 
 

@@ -29,6 +29,7 @@ from navrep_data.models import (
     TransformerWorldModel,
     VAEConfig,
     WorldModel,
+    checkpoint,
 )
 from navrep_data.shards import LOCK_FILE, writer_lock
 from navrep_data.train import state
@@ -95,6 +96,7 @@ def make_model(recipe: Recipe) -> nn.Module:
         )  # fmt: skip
 
 
+@checkpoint.single_precision()
 def train_world_model(
     recipe: Recipe,
     data: Path | str,
@@ -198,7 +200,8 @@ def claim(
     before = read_json(path, _MAX_RECIPE)
     old = before.get("settings") if isinstance(before, dict) else None
     old = old if isinstance(old, dict) else {}
-    for name, value in settings.items():
+    for name in dict.fromkeys((*settings, *old)):  # a setting at its default may be left out on either side
+        value = settings.get(name)
         if name not in free and old.get(name) != value:
             raise ConfigError(
                 f"{out} was started with {name} = {old.get(name)!r}, this resume has {value}: use the "

@@ -16,20 +16,12 @@ from torch import Tensor
 
 from navrep_data.envs.sb3 import WorldBatch
 from navrep_data.models.controllers import N_ACTIONS
-from navrep_data.schema import ACTION_SIZE, Event
-from navrep_data.sim import SimConfig, Simulator
+from navrep_data.schema import Event
+from navrep_data.sim import SimConfig, Simulator, velocity_commands
 from navrep_data.zoo.policy import Policy
+from navrep_data.zoo.sb3_worlds import Encoded, eyes, shorten
 
 F32 = NDArray[np.float32]
-
-
-def shorten(actions: F32, max_speed: float) -> F32:
-    """Return actions (W, 2) clipped to [-1, 1] and no longer than `max_speed` [m/s]; 0 = no limit."""
-    clipped = np.clip(actions, -1.0, 1.0)
-    if max_speed > 0.0:
-        length = np.linalg.norm(clipped, axis=1, keepdims=True)
-        clipped = clipped * (max_speed / np.maximum(length, max_speed))
-    return np.asarray(clipped, np.float32)
 
 
 def _distance(state: F32) -> NDArray[np.float64]:
@@ -110,7 +102,7 @@ class TrainingWorlds(WorldBatch):
         self._to_go = np.zeros(n_worlds)
         self._actions = np.zeros((n_worlds, N_ACTIONS), np.float32)
         self._returns, self._lengths = np.zeros(n_worlds), np.zeros(n_worlds, np.int64)
-        self._last = np.zeros((n_worlds, policy.n_inputs), np.float32)
+        self._encoded = Encoded(policy, n_worlds, config)
         self._start = time.time()
         self.outcomes: list[Event] = []
         self.seconds = {"simulate": 0.0, "encode": 0.0}
@@ -125,11 +117,9 @@ class TrainingWorlds(WorldBatch):
         """Start an episode in every world."""
         self.simulator.reset()
         self._returns[:], self._lengths[:] = 0.0, 0
-        self.policy.reset(batch_size=self.num_envs)
         scan, state = self.simulator.observe()
         self._to_go = _distance(state)
-        self._last = self.policy.encode(scan, state)
-        return self._last.copy()
+        return self._encoded.start(scan, state)
 
     def restart(self, seed: int, difficulty: NDArray[np.int64]) -> None:
         """Go on in worlds from another stream, as difficult as given; call :meth:`reset` next."""
@@ -151,7 +141,7 @@ class TrainingWorlds(WorldBatch):
 
     def step_wait(self) -> tuple[F32, F32, NDArray[np.bool_], list[dict[str, Any]]]:
         """Step all worlds; those whose episode ends start the next one."""
-        before = self._last
+        before = self._encoded.last
         found = self.advance(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         now = round(time.time() - self._start, 6)
@@ -169,8 +159,7 @@ class TrainingWorlds(WorldBatch):
         """Step all worlds by actions (W, 2); those whose episode ends start the next one."""
         began = time.perf_counter()
         velocity = shorten(actions, self.max_speed)
-        commands = np.zeros((self.num_envs, ACTION_SIZE))
-        commands[:, :N_ACTIONS] = velocity
+        commands = velocity_commands(self.config, velocity)
         rewards, events = self.simulator.step(commands)
         done = events != Event.NONE
         self._returns += rewards
@@ -178,7 +167,7 @@ class TrainingWorlds(WorldBatch):
         over = np.flatnonzero(done)
         finished = over, events[over], self._returns[over], self._lengths[over]
         cut = np.flatnonzero(events == Event.TIMEOUT) if self.truncate else np.zeros(0, np.int64)
-        ends = np.zeros((0, self._last.shape[1]), np.float32)
+        ends = np.zeros((0, self.policy.n_inputs), np.float32)
         last_seen = self.simulator.observe() if len(cut) else None
         if len(over):
             self.outcomes += [Event(int(event)) for event in events[over]]
@@ -190,21 +179,12 @@ class TrainingWorlds(WorldBatch):
         self._to_go = to_go
         middle = time.perf_counter()
         if last_seen is not None:
-            ends = self._ends(last_seen[0][cut], last_seen[1][cut], self._last[cut])
-        self.policy.observe(velocity)
-        if len(over):
-            self.policy.reset(mask=done)
-        self._last = self.policy.encode(scan, state)
+            ends = self._encoded.ends(last_seen[0][cut], last_seen[1][cut], cut)
+        features = self._encoded.step(commands, done, scan, state)
         self.seconds["simulate"] += middle - began
         self.seconds["encode"] += time.perf_counter() - middle
         scaled = (shaped * self.reward_scale).astype(np.float32)
-        return Stepped(self._last.copy(), scaled, done, finished, cut, ends)
-
-    def _ends(self, scan: F32, state: F32, before: F32) -> F32:
-        """Return the observations that truncated episodes end with."""
-        fresh, _ = self.policy.look(scan, state)
-        n_memory = self.policy.world_model.h_size if self.policy.world_model is not None else 0
-        return np.concatenate([fresh, before[:, before.shape[1] - n_memory :]], axis=1) if n_memory else fresh
+        return Stepped(features, scaled, done, finished, cut, ends)
 
     def take_outcomes(self) -> list[Event]:
         """Return how episodes ended since the last call, and forget it."""
@@ -317,12 +297,14 @@ def play(policy: Policy, config: SimConfig, numpy_seeds: Sequence[int]) -> list[
     simulator = Simulator(config, n)
     simulator.reset_seeded(np.asarray(numpy_seeds))
     policy.reset(batch_size=n)
+    see = eyes(config, policy)
     ended = np.zeros(n, np.uint8)
     most = int(np.ceil(config.time_limit / config.sensor.dt)) + 2
     for _ in range(most):
         scan, state = simulator.observe()
-        action: Any = policy.act(scan, state)
-        command = action.numpy() if isinstance(action, Tensor) else action
+        action: Any = policy.act(see(scan), state)
+        command = velocity_commands(config, (action.numpy() if isinstance(action, Tensor) else action)[:, :N_ACTIONS])
+        policy.observe(command)
         _, events = simulator.step(np.where((ended == 0)[:, None], command, 0.0))
         ended = np.where(ended == 0, events, ended)
         if (ended != 0).all():

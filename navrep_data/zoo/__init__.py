@@ -126,18 +126,23 @@ def load_sb3(name: str, source: str | os.PathLike[str] | None = None, env: Any =
         Name of a policy.
     source : path-like or str, optional
         As for :func:`load`.
-    env : gymnasium.Env or VecEnv, optional
-        Environment to train in; without one the model only predicts.
+    env : str, SimConfig, gymnasium.Env, gymnasium.vector.VectorEnv or VecEnv, optional
+        Environment to train in: a name such as ``"navrep-train"``, of which ``n_envs`` worlds (6) are made, or a NavRep
+        environment, whose scans the policy's encoder turns into features. Without one the model predicts, until
+        ``set_env`` gives it one.
     **options
-        Passed on to ``stable_baselines3.PPO``.
+        Passed on to ``stable_baselines3.PPO``, but for ``n_envs``.
 
     Returns
     -------
     stable_baselines3.PPO
-        Its observations are the controller's features, or the raw vector of end-to-end policies.
+        Its observations are the controller's features, or the raw vector of end-to-end policies. ``learn`` trains the
+        controller alone, not the encoder (of end-to-end policies all); ``save`` and ``load`` are stable-baselines3's.
 
     Raises
     ------
+    ConfigError
+        If the environment's observations, actions or sensor are not what the policy takes.
     UnknownNameError, CorruptDataError, OfflineError, DownloadError
         As :func:`load`.
     """

@@ -21,6 +21,7 @@ from navrep_data.zoo.importers import load_any, load_controller_zip, load_tf_jso
 from navrep_data.zoo.policy import INFERENCE, Policy
 
 
+@checkpoint.building()
 def build(
     record: Mapping[str, Any],
     files: Mapping[str, Path],

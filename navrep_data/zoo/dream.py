@@ -112,8 +112,8 @@ class DreamEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._whole = np.flatnonzero(self._starts.table.count == real_rows)
         if len(self._whole) == 0:
             raise ConfigError(f"No episode in {data} has {real_rows} rows, expected longer ones: lower real_rows.")
-        self._z, self._goal, self._taken = torch.zeros(0), torch.zeros(0), torch.zeros(0)
-        self._width = torch.zeros(found.z_size)
+        self._z, self._goal, self._taken = (torch.zeros(0, dtype=torch.float32, device="cpu") for _ in range(3))
+        self._width = torch.zeros(found.z_size, dtype=torch.float32, device="cpu")
         self._steps = 0
         self._obs: Observation | None = None
         self._decoded = np.zeros(0, np.float32)
@@ -174,7 +174,7 @@ class DreamEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _predict(self) -> tuple[Tensor, Tensor]:
         """Return code and goal of the next row, from the newest rows that the model can look at."""
-        led_to = torch.cat([torch.zeros(1, 1, ACTION_SIZE), self._taken[:, :-1]], dim=1)
+        led_to = torch.cat([torch.zeros(1, 1, ACTION_SIZE, dtype=torch.float32), self._taken[:, :-1]], dim=1)
         actions = self._taken if self.model.config.action_alignment == "taken" else led_to
         # the modular LSTM was trained to run on; the others see a window
         n = self._z.shape[1] if isinstance(self.model, ModularWorldModel) else CONTEXT

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from navrep_data.errors import ArrayError, CheckpointError, ConfigError, PolicyError
+from navrep_data.models.checkpoint import building
 from navrep_data.models.config import OBSERVATION_SHAPES
 from navrep_data.models.controllers import ActorCritic, EndToEnd
 from navrep_data.models.encoder import FrozenEncoder
@@ -144,7 +145,7 @@ class Policy:
         # what the memory is fed one step later, once the action taken is known
         self._waiting: tuple[Tensor, Tensor, Tensor] | None = None
         self._fresh = torch.zeros(0, dtype=torch.bool, device=self.device)
-        self._last = torch.zeros(0, ACTION_SIZE, device=self.device)
+        self._last = torch.zeros(0, ACTION_SIZE, dtype=torch.float32, device=self.device)
 
     def _check_parts(self) -> None:
         if self.lidar is None:
@@ -169,6 +170,7 @@ class Policy:
     def _who(self) -> str:
         return self.name or "This policy"
 
+    @building()
     def _make_encoder(self, dtype: str, compile: bool) -> torch.nn.Module | None:
         if isinstance(self.network, EndToEnd):
             net = self.network
@@ -224,7 +226,7 @@ class Policy:
         other._scale = None if robot == self.trained_on else RobotScale(self.trained_on, robot, self.sensor.range_max)
         other._stream, other._noise, other._waiting = None, None, None
         other._fresh = torch.zeros(0, dtype=torch.bool, device=self.device)
-        other._last = torch.zeros(0, ACTION_SIZE, device=self.device)
+        other._last = torch.zeros(0, ACTION_SIZE, dtype=torch.float32, device=self.device)
         return other
 
     # --- episodes ----------------------------------------------------------------------------------------------
@@ -266,7 +268,7 @@ class Policy:
         n = max(1, n) if batch_size is None else batch_size
         if type(n) is not int or n < 1:
             raise PolicyError(f"batch_size is {n!r}, expected a whole number of at least 1.")
-        self._last = torch.zeros(n, ACTION_SIZE, device=self.device)
+        self._last = torch.zeros(n, ACTION_SIZE, dtype=torch.float32, device=self.device)
         self._waiting, self._fresh = None, torch.ones(n, dtype=torch.bool, device=self.device)
         self._noise = Noise.seeded(self.seed, self.device) if self.inference == "as_released" else None
         if self.world_model is not None:
@@ -421,7 +423,7 @@ class Policy:
         assert self.lidar is not None
         if self.features is None:
             if self.lidar == "1d":
-                obs = torch.tensor(fill_blind(ranges))
+                obs = torch.tensor(fill_blind(ranges), device="cpu")
             else:
                 obs = observation_from_scan(ranges, "rings", zero_first_bin=False).flatten(1)
             obs = obs.to(self.device)
@@ -525,7 +527,8 @@ class Policy:
 
 def _tensor(value: Any, device: torch.device) -> Tensor:
     """Return a float32 tensor that shares no memory with an ndarray, which may be read-only."""
-    source = value.detach() if isinstance(value, Tensor) else torch.tensor(np.asarray(value, dtype=np.float32))
+    host = torch.device("cpu")  # whatever the default device is
+    source = value.detach() if isinstance(value, Tensor) else torch.tensor(np.asarray(value, np.float32), device=host)
     return source.to(device, torch.float32)
 
 

@@ -9,15 +9,20 @@ import gymnasium
 import numpy as np
 import torch
 from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
+from navrep_data.errors import ConfigError
+from navrep_data.models.checkpoint import building
 from navrep_data.models.config import EndToEndConfig
 from navrep_data.models.controllers import LEAST_STD, MOST_STD, ActorCritic, EndToEnd, limit_speed
 from navrep_data.schema import ROBOT_STATE_SIZE
 from navrep_data.zoo.policy import Policy
+from navrep_data.zoo.sb3_worlds import controller_worlds
 
 # Read from the zips: the same in all 53 released runs (paper section III-C). Batch = 128 steps x 6 environments / 4.
 N_ENVS = 6
@@ -34,6 +39,8 @@ HYPERPARAMETERS: dict[str, Any] = {
     "vf_coef": 0.5,
     "max_grad_norm": 0.5,
 }
+ROLLOUT_PARTS = 4
+"""Minibatches per rollout."""
 # stable-baselines 2's Adam; torch's default is 1e-8
 _ADAM_EPS = 1e-5
 
@@ -91,6 +98,44 @@ class BoundedPolicy(ActorCriticPolicy):
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         return limit_speed(super()._predict(observation, deterministic), self.max_speed)
+
+
+class ControllerPPO(PPO):
+    """PPO of a policy's controller, which any NavRep environment can be set for.
+
+    Attributes
+    ----------
+    driver : Policy or None
+        Whose encoder and memory turn scans into features; not saved, so that after ``load`` features come from
+        elsewhere, such as a :class:`navrep_data.zoo.sb3_worlds.ControllerWorlds`.
+    """
+
+    driver: Policy | None = None
+
+    def set_env(self, env: Any, force_reset: bool = True) -> None:
+        """Set the environment to train in, with as many worlds as it has; see :func:`controller_worlds`."""
+        if self.driver is not None:
+            env = controller_worlds(self.driver, env, self.n_envs)
+        if isinstance(env, VecEnv) and env.num_envs != self.n_envs:
+            # stable-baselines3 refuses this, since its buffer has a row per world
+            self.n_envs = env.num_envs
+            self.batch_size = max(1, self.n_steps * self.n_envs // ROLLOUT_PARTS)
+            self.rollout_buffer = RolloutBuffer(
+                self.n_steps, self.observation_space, self.action_space, device=self.device, gamma=self.gamma,
+                gae_lambda=self.gae_lambda, n_envs=self.n_envs,
+            )  # fmt: skip
+        super().set_env(env, force_reset)
+
+    def learn(self, *args: Any, **kwargs: Any) -> Any:
+        """Train, as stable-baselines3 does; refused where there is no environment."""
+        if self.env is None:
+            raise ConfigError(
+                "There is no environment to learn in: load_sb3(NAME, env='navrep-train'), or model.set_env(...) first."
+            )
+        return super().learn(*args, **kwargs)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "driver"]
 
 
 class EndToEndExtractor(BaseFeaturesExtractor):
@@ -154,34 +199,41 @@ def to_sb3(policy: Policy, env: Any = None, **options: Any) -> PPO:
     ----------
     policy : Policy
         From the zoo. Its encoder stays outside: observations are what ``policy.encode`` returns.
-    env : gymnasium.Env or VecEnv, optional
-        To train in, with observations of shape (n_inputs,) and actions of shape (2,). Without one the model predicts;
-        ``set_env`` then takes environments of 6 worlds, as the original trained with.
+    env : str, SimConfig, gymnasium.Env, gymnasium.vector.VectorEnv or VecEnv, optional
+        To train in, see :func:`navrep_data.zoo.sb3_worlds.controller_worlds`. Without one the model predicts, and
+        learns after ``set_env``, which takes the same and any number of worlds.
     **options
-        Instead of the hyper-parameters of the released runs; ``n_envs`` sets the worlds of a model without `env`.
+        Instead of the hyper-parameters of the released runs; ``n_envs`` sets the worlds of a named `env`.
 
     Returns
     -------
-    stable_baselines3.PPO
+    ControllerPPO
         ``predict(features, deterministic=True)`` gives what ``policy.act`` executes: the mean clipped to [-1, 1]; of
         our own controllers (a :class:`BoundedPolicy`) its tanh, shortened to their speed limit.
 
     Notes
     -----
     Released runs: stable-baselines 2.10 PPO2. The unused state-action value is left out; the optimiser starts anew.
-    An environment to train our own controllers in should shorten velocities to ``policy.network.config.max_speed``
-    itself.
+    An environment of features, which is taken as it is, should shorten velocities to
+    ``policy.network.config.max_speed`` itself.
     """
     observation_space, action_space = spaces(policy)
     n_envs = options.pop("n_envs", N_ENVS)
+    if env is not None:
+        env = controller_worlds(policy, env, n_envs)
+        rows = options.get("n_steps", HYPERPARAMETERS["n_steps"]) * env.num_envs
+        # the released runs' share of a rollout, where the number of worlds or steps is another
+        options.setdefault("batch_size", max(1, rows // ROLLOUT_PARTS))
     settings = {**HYPERPARAMETERS, "device": "cpu", **options}
     settings.setdefault("policy_kwargs", _policy_kwargs(policy.network))
     kind = BoundedPolicy if policy.network.config.squash == "tanh" else ActorCriticPolicy
-    model = PPO(kind, env, _init_setup_model=False, **settings)
-    if env is None:
-        model.observation_space, model.action_space, model.n_envs = observation_space, action_space, n_envs
-    model._setup_model()
-    put_weights(model.policy, policy.network)
+    with building():  # whose weights are drawn and overwritten
+        model = ControllerPPO(kind, env, _init_setup_model=False, **settings)
+        if env is None:
+            model.observation_space, model.action_space, model.n_envs = observation_space, action_space, n_envs
+        model._setup_model()
+        put_weights(model.policy, policy.network)
+    model.driver = policy
     return model
 
 
