@@ -9,7 +9,7 @@ import typer
 
 from navrep_data.cli._common import print_json, say, say_err, show_progress
 from navrep_data.errors import ConfigError
-from navrep_data.registration import environment_of
+from navrep_data.registration import ENVIRONMENTS, spelled
 
 if TYPE_CHECKING:
     from navrep_data.train import Recipe, Trained
@@ -273,7 +273,7 @@ def controller_command(
     model = load_any_model(world_model, source)
     lidar = vae_of(model, world_model).config.lidar
     changes = {"steps": steps, "worlds": worlds, "batch": batch, "seed": seed, "validate_every": validate_every,
-               "env": None if env is None else environment_of(env)}  # fmt: skip
+               "env": spelled(env, ENVIRONMENTS) or env}  # fmt: skip
     _train_controller(
         features, lidar, original, settings, changes, out, model, world_model, init, resume, stop_after, device, source,
         as_json,
@@ -292,7 +292,7 @@ def e2e_command(
     use_threads(threads)
     check_device(device)
     changes = {"steps": steps, "worlds": worlds, "batch": batch, "seed": seed, "validate_every": validate_every,
-               "env": None if env is None else environment_of(env)}  # fmt: skip
+               "env": spelled(env, ENVIRONMENTS) or env}  # fmt: skip
     _train_controller(
         "e2e", lidar, original, settings, changes, out, None, "", init, resume, stop_after, device, source, as_json
     )

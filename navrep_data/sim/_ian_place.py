@@ -1,7 +1,7 @@
 # mypy: allow-untyped-defs, allow-untyped-decorators, no-check-untyped-defs
 """Put the robot of a world on a map somewhere else, right after a reset."""
 
-from navrep_data._kernels import kernel
+from navrep_data.kernels import kernel
 from navrep_data.sim._ian_layout import M_HAS_FIELD, M_MAP, W_FIELD, W_PERMISSIVITY
 from navrep_data.sim._ian_motion import remember, show
 from navrep_data.sim._ian_reset import _keep_field, _put
