@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import enum
 import math
+import numbers
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
-from navrep_data.errors import ConfigError
+from navrep_data.errors import ConfigError, SchemaVersionError
 
 FORMAT_NAME = "navrep-data"
 FORMAT_VERSION = 1
@@ -111,7 +113,7 @@ class RobotContract:
     Attributes
     ----------
     max_speed : float
-        Velocity along x and y that an action of 1 stands for [m/s].
+        Velocity along x and y that an action of 1 stands for [m/s]; any real number, numpy's too, kept as a float.
     radius : float
         Radius of the footprint [m]; where it is drawn for every episode (0.3 to 0.5 m in worlds of polygons), the
         smallest.
@@ -123,13 +125,14 @@ class RobotContract:
     def __post_init__(self) -> None:
         """Check both."""
         for name, value, most in (("max_speed", self.max_speed, 100.0), ("radius", self.radius, 10.0)):
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= most:
+            if isinstance(value, bool) or not isinstance(value, numbers.Real) or not 0.0 < value <= most:
                 unit = "m/s" if name == "max_speed" else "m"
                 raise ConfigError(f"A robot's {name} is {value!r}, expected more than 0 and at most {most:g} {unit}.")
+            object.__setattr__(self, name, float(value))
 
     def to_dict(self) -> dict[str, float]:
         """Return the fields as plain JSON values."""
-        return {"max_speed": float(self.max_speed), "radius": float(self.radius)}
+        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -194,6 +197,38 @@ COLUMNS: dict[str, Column] = {
 }  # fmt: skip
 
 
+INFERENCE = ("deterministic", "as_released")
+"""How memories run: without noise, or with that of the release."""
+RANGES = ("contract", "as_released")
+"""How ranges reach a network: cut at its contract's, or as the authors fed them."""
+SCALING = ("robot", "none")
+"""Whether a network is shown the robot in the proportions of that of its training, or drives as trained."""
+RESULTS_FORMAT, RESULTS_VERSION = "navrep-data-benchmark", 2
+"""What a results file of a benchmark begins with. 2: contacts, time stopped and the first round."""
+
+
+def check_results_version(value: Any, path: Path | str) -> None:
+    """Refuse a results file of the version that did not record contacts.
+
+    Parameters
+    ----------
+    value : object
+        The file's JSON, whatever it is.
+    path : path-like
+        The file, for the message.
+
+    Raises
+    ------
+    SchemaVersionError
+        If it is one.
+    """
+    if isinstance(value, Mapping) and (value.get("format"), value.get("version")) == (RESULTS_FORMAT, 1):
+        raise SchemaVersionError(
+            f"{path} is of format version 1, which does not say what the robot touched, expected version "
+            f"{RESULTS_VERSION}: play it again, navrep-data benchmark NAME --suite SUITE with another --out."
+        )
+
+
 def fed_as(settings: Mapping[str, Any]) -> str:
     """Return in words how a network was fed where that is not the default, from the settings in a results file."""
     if settings.get("ranges") == "as_released":
@@ -203,6 +238,6 @@ def fed_as(settings: Mapping[str, Any]) -> str:
 
 def result_name(name: str, settings: Mapping[str, Any]) -> str:
     """Return what results are called: the policy's name, and how it ran where that is not the default."""
-    noise = "as released" if settings.get("inference") == "as_released" else ""
+    noise = "noise of the release" if settings.get("inference") == "as_released" else ""
     how = ", ".join(word for word in (noise, fed_as(settings)) if word)
     return f"{name} ({how})" if how else name

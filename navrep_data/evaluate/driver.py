@@ -130,9 +130,9 @@ def benchmark(
         ``"contract"``: networks get ranges cut where those of their training were (25 m). ``"as_released"``, for
         released networks only: uncut, as the authors' software feeds them (up to 109 m on the office map).
     scaling : str, optional
-        ``"robot"``, the default: where the robot is slower or smaller than that of its training, a network sees and
-        moves in proportion, see :meth:`navrep_data.zoo.policy.Policy.for_robot`. ``"none"``: as trained, and the
-        default for ranges as released.
+        ``"robot"``, the default: on another robot than that of training a network sees and moves in proportion, see
+        :meth:`navrep_data.zoo.policy.Policy.for_robot`. ``"none"``: as trained, and the default for ranges as the
+        authors fed them.
     first_round : int
         The first round: rounds ``first_round`` to ``first_round + episodes - 1`` of every scenario are played (in
         ``navreptest`` a round is an episode). Results of another first round than 0 lie apart, in
@@ -257,7 +257,7 @@ def write_report(
     """
     chosen = [r for r in found if names is None or r.header["name"] in names]
     rows = {r.name: summary(r) for r in found}
-    baseline = next((row for r, row in zip(found, rows.values(), strict=True) if r.header["name"] == "goal"), None)
+    baseline = next((rows[r.name] for r in found if r.header["name"] == "goal"), None)
     if baseline is None:
         raise DatasetNotFoundError(f"{folder} has no results of 'goal', expected them beside every score: play it too.")
     mine = [rows[r.name] for r in chosen]
@@ -272,6 +272,15 @@ def write_report(
 
         report.files += draw(chosen, mine, groups, baseline, folder)
     return report
+
+
+def _check_one_each(found: Sequence[Results], files: Sequence[Path]) -> None:
+    """Refuse two files of one policy that was run in one way: which of them counts is not ours to say."""
+    first: dict[tuple[Any, ...], Path] = {}
+    for results, file in zip(found, files, strict=True):
+        other = first.setdefault((results.name, results.suite.name, results.physics, results.first_round), file)
+        if other != file:
+            raise ConfigError(f"{other} and {file} both hold results of {results.name}, expected one: move one away.")
 
 
 def redraw(folder: str | os.PathLike[str], figures: bool = True) -> Benchmark:
@@ -290,6 +299,8 @@ def redraw(folder: str | os.PathLike[str], figures: bool = True) -> Benchmark:
         If there are no results.
     CorruptDataError
         If a file is none.
+    ConfigError
+        If results are of several suites, physics or first rounds, or two files are of one policy.
     """
     path = Path(folder)
     files = [path] if path.is_file() else sorted(path.glob("*.json"))
@@ -298,6 +309,7 @@ def redraw(folder: str | os.PathLike[str], figures: bool = True) -> Benchmark:
     names = None
     home = path.parent if path.is_file() else path
     found = [Results.load(f) for f in files]
+    _check_one_each(found, files)
     if path.is_file():
         names = [found[0].header["name"]]
         if names != ["goal"] and (home / "goal.json").is_file():

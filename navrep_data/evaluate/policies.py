@@ -15,6 +15,7 @@ from navrep_data.evaluate.baselines import DwaPilot, GoalPilot, OrcaPilot, Rando
 from navrep_data.evaluate.pilots import FunctionPilot, Pilot, ZooPilot, source_hash
 from navrep_data.generate.policy import load_callable
 from navrep_data.io import sha256_file
+from navrep_data.schema import INFERENCE, RANGES, SCALING
 from navrep_data.zoo.fetching import HUB_SCHEME
 from navrep_data.zoo.folders import is_path, place_of, policy_files
 from navrep_data.zoo.names import here_hint
@@ -22,9 +23,6 @@ from navrep_data.zoo.names import here_hint
 BASELINES: dict[str, type[Pilot]] = {pilot.name: pilot for pilot in (GoalPilot, RandomPilot, OrcaPilot, DwaPilot)}
 """Policies without weights, by name."""
 
-INFERENCE = ("deterministic", "as_released")
-RANGES = ("contract", "as_released")
-SCALING = ("robot", "none")
 NETWORKS = ("zoo", "folder")
 """Kinds of policies for which inference, ranges and scaling mean something."""
 
@@ -144,7 +142,7 @@ def resolve_policy(
 
 
 def _scaling(ranges: str, scaling: str | None) -> str:
-    """Return how networks are scaled: to the robot, but for ranges as released, which nobody scaled."""
+    """Return how networks are scaled: to the robot, but for ranges as the authors fed them, which nobody scaled."""
     if ranges not in RANGES:
         raise ConfigError(f"ranges is {ranges!r}, expected one of: {', '.join(RANGES)}.")
     if scaling is None:

@@ -15,17 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from navrep_data._version import __version__
-from navrep_data.errors import CorruptDataError, DatasetMismatchError, SchemaVersionError
+from navrep_data.errors import CorruptDataError, DatasetMismatchError
 from navrep_data.evaluate.metrics import METRICS, Contacts
 from navrep_data.evaluate.policies import PilotSpec
 from navrep_data.evaluate.runner import Episode
 from navrep_data.evaluate.suites import Suite, get_suite
 from navrep_data.io import atomic_write_bytes, read_json
-from navrep_data.schema import Event, fed_as, result_name
+from navrep_data.schema import RESULTS_FORMAT, RESULTS_VERSION, Event, check_results_version, fed_as, result_name
 
-FORMAT = "navrep-data-benchmark"
-FORMAT_VERSION = 2
-"""2: contacts, time stopped and the first round."""
 LETTERS = {Event.GOAL: "S", Event.TIMEOUT: "T"}
 """One letter per outcome: S goal, T timeout, C any collision, - not played."""
 NOT_PLAYED = "-"
@@ -166,7 +163,7 @@ class Results:
             str(k): np.rint(100.0 * xy).astype(int).ravel().tolist() for k, xy in sorted(self.trajectories.items())
         }
         value = {
-            "format": FORMAT, "version": FORMAT_VERSION, **self.header,
+            "format": RESULTS_FORMAT, "version": RESULTS_VERSION, **self.header,
             "outcome": "".join(self.outcome), "episodes": columns, "trajectories_cm": paths,
         }  # fmt: skip
         atomic_write_bytes(path, _lines(value))
@@ -183,13 +180,9 @@ class Results:
             If it is of the version that did not record contacts.
         """
         value = read_json(path, _MAX_BYTES)
-        if isinstance(value, dict) and (value.get("format"), value.get("version")) == (FORMAT, 1):
-            raise SchemaVersionError(
-                f"{path} is of format version 1, which does not say what the robot touched, expected version "
-                f"{FORMAT_VERSION}: play it again, navrep-data benchmark NAME --suite SUITE with another --out."
-            )
+        check_results_version(value, path)
         try:
-            if value["format"] != FORMAT or value["version"] != FORMAT_VERSION:
+            if value["format"] != RESULTS_FORMAT or value["version"] != RESULTS_VERSION:
                 raise ValueError(f"format {value['format']!r} version {value['version']!r}")
             results = cls({key: value[key] for key in ("name", "sees", "variant", "settings", "versions")})
             results._read(value)

@@ -208,7 +208,8 @@ class WorldModel(nn.Module):
             policies were trained with), ``"newest-32"`` the last 32; ``"carried-state"`` is the modular LSTM that
             runs on for ever. Left out: what the released model of this kind was used with.
         noise : Noise, optional
-            Dropout, sampled z and random initial state, drawn anew for the whole window at every step, as released.
+            Dropout, sampled z and random initial state, drawn anew for the whole window at every step, as the
+            authors' software does.
 
         Raises
         ------

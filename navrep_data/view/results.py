@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, NavrepDataError, SchemaVersionError
+from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, NavrepDataError
 from navrep_data.io import read_json
-from navrep_data.schema import DT, EVENT_NAMES, result_name
+from navrep_data.schema import DT, EVENT_NAMES, RESULTS_FORMAT, RESULTS_VERSION, check_results_version, result_name
 from navrep_data.view.packing import Blob
 from navrep_data.view.page import DEFAULT_MAX_BYTES, MIN_MAX_BYTES, Page, assemble, clip
 
-FORMAT, FORMAT_VERSION = "navrep-data-benchmark", 2
 MAX_FILE_BYTES = 64 << 20
 MAX_POLICIES = 60
 MAX_EPISODES = 20_000
@@ -167,7 +166,7 @@ def _load(root: Path) -> list[_Policy]:
     for file in files:
         value = read_json(file, MAX_FILE_BYTES)
         # a folder may hold other JSON beside the results; a file that was named is meant
-        if root.is_dir() and not (isinstance(value, dict) and value.get("format") == FORMAT):
+        if root.is_dir() and not (isinstance(value, dict) and value.get("format") == RESULTS_FORMAT):
             continue
         found.append(_parse(value, file))
     if not found:
@@ -184,13 +183,9 @@ def _load(root: Path) -> list[_Policy]:
 
 def _parse(value: Any, file: Path) -> _Policy:
     """Return a results file as a policy, every value checked."""
-    if isinstance(value, dict) and (value.get("format"), value.get("version")) == (FORMAT, 1):
-        raise SchemaVersionError(
-            f"{file} is of format version 1, which does not say what the robot touched, expected version "
-            f"{FORMAT_VERSION}: play it again, navrep-data benchmark NAME --suite SUITE with another --out."
-        )
+    check_results_version(value, file)
     try:
-        if value["format"] != FORMAT or value["version"] != FORMAT_VERSION:
+        if value["format"] != RESULTS_FORMAT or value["version"] != RESULTS_VERSION:
             raise ValueError(f"format {value['format']!r} version {value['version']!r}")
         columns, settings = value["episodes"], dict(value["settings"])
         n = len(value["outcome"])

@@ -76,8 +76,9 @@ def load(
         Folder, ``https://...`` or ``hf://user/name`` to look in before the cache and the authors' repository.
         Default: ``NAVREP_RELEASED_DIR`` where it is set.
     inference : str
-        ``"deterministic"``: no dropout, z = mu, memory starts at zero. ``"as_released"``: as the authors' software
-        runs them, with dropout, sampled z in the memory and a random start, under `seed`.
+        ``"deterministic"``: no dropout, z = mu, memory starts at zero. ``"as_released"``: memories with the noise
+        of the release (dropout, sampled z and a random start), under `seed`. Nothing else is changed by it: ranges are
+        cut at the contract's unless `ranges` says otherwise.
     seed : int
         Seed of ``"as_released"``.
     **options

@@ -15,10 +15,10 @@ from navrep_data.models.modular import MDNRNN, ModularWorldModel
 from navrep_data.models.noise import Noise
 from navrep_data.models.vae import VAE
 from navrep_data.models.world_model import WorldModel
-from navrep_data.schema import SensorContract
+from navrep_data.schema import INFERENCE, SensorContract
 from navrep_data.zoo.folders import trained_robot
 from navrep_data.zoo.importers import load_any, load_controller_zip, load_tf_json, load_torch_world_model
-from navrep_data.zoo.policy import INFERENCE, Policy
+from navrep_data.zoo.policy import Policy
 
 
 @checkpoint.building()

@@ -21,10 +21,8 @@ from navrep_data.models.observation import observation_from_scan
 from navrep_data.models.vae import VAE
 from navrep_data.models.world_model import Stream, WorldModel
 from navrep_data.observations import RobotScale, fill_blind
-from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, RobotContract, SensorContract
+from navrep_data.schema import ACTION_SIZE, INFERENCE, RANGES, ROBOT_STATE_SIZE, RobotContract, SensorContract
 
-INFERENCE = ("deterministic", "as_released")
-RANGES = ("contract", "as_released")
 FEATURES = ("z", "h", "zh")
 _ADAPT = "put the sensor's scans through navrep_data.observations.ScanAdapter"
 # The farthest range that a scan may hold, as a multiple of range_max: beyond it is another unit. Halls and maps are
@@ -195,9 +193,10 @@ class Policy:
         Parameters
         ----------
         max_speed : float, optional
-            Velocity along x and y that an action of 1 stands for on that robot [m/s]; as trained if left out.
+            Velocity along x and y that an action of 1 stands for on that robot [m/s]; that of :attr:`robot` if left
+            out, which is as trained until it has been set once.
         radius : float, optional
-            Radius of its footprint [m]; as trained if left out.
+            Radius of its footprint [m]; that of :attr:`robot` if left out.
 
         Returns
         -------
@@ -208,7 +207,7 @@ class Policy:
         Raises
         ------
         ConfigError
-            If a number is not positive, or ranges are as released: the authors' software scales nothing.
+            If a number is not positive, or ranges are as the authors fed them: their software scales nothing.
 
         Notes
         -----
@@ -216,11 +215,13 @@ class Policy:
         chosen.
         """
         robot = RobotContract(
-            self.trained_on.max_speed if max_speed is None else max_speed,
-            self.trained_on.radius if radius is None else radius,
+            self.robot.max_speed if max_speed is None else max_speed,
+            self.robot.radius if radius is None else radius,
         )
         if robot != self.trained_on and self.ranges == "as_released":
-            raise ConfigError(f"{self._who()} takes ranges as released, which are not scaled: load it without ranges=.")
+            raise ConfigError(
+                f"{self._who()} takes ranges as the authors fed them, which are not scaled: load it without ranges=."
+            )
         other = copy.copy(self)
         other.robot = robot
         other._scale = None if robot == self.trained_on else RobotScale(self.trained_on, robot, self.sensor.range_max)
@@ -308,7 +309,8 @@ class Policy:
         Parameters
         ----------
         scan : ndarray or Tensor of shape (B, 1080) [m]
-            Ranges; ray 0 straight ahead, anticlockwise, 25 or more where a ray hits nothing.
+            Ranges; ray 0 straight ahead, anticlockwise, 25 or more where a ray hits nothing, +inf included: that is
+            25, whatever `ranges` is.
         robot_state : ndarray or Tensor of shape (B, 5) [m, m, m/s, m/s, rad/s]
             Goal x, y, velocity x, y and turn rate, robot frame.
 
@@ -320,7 +322,8 @@ class Policy:
         Raises
         ------
         ArrayError
-            If the arrays are not what the model takes; another sensor's scans go through ScanAdapter.
+            If the arrays are not what the model takes, or a range is NaN, negative, or farther than a scan in metres
+            has it (1000 m); another sensor's scans go through ScanAdapter.
         PolicyError
             If the batch size is not that of :meth:`reset`, or the policy has no encoder.
         """
@@ -382,10 +385,15 @@ class Policy:
         features : ndarray of shape (B, F)
             [z, robot state] or [robot state]; end-to-end: [observation, robot state].
         robot_state : ndarray of shape (B, 5)
-            As given, float32.
+            As given, float32, for another robot in the proportions of the one of training.
+
+        Raises
+        ------
+        ArrayError, PolicyError
+            As :meth:`act`.
         """
+        ranges, state = self._fitted(*self._checked(scan, robot_state))
         assert self.lidar is not None
-        ranges, state = self._fitted(np.asarray(scan, np.float32), _tensor(robot_state, self.device))
         if self.features == "h":
             return state.cpu().numpy(), state.cpu().numpy()
         obs = observation_from_scan(ranges, self.lidar, self.features is not None).to(self.device)
@@ -415,7 +423,7 @@ class Policy:
 
     def _features(self, scan: NDArray[Any] | Tensor, robot_state: NDArray[Any] | Tensor) -> tuple[Tensor, Tensor]:
         """Return features on the device, and the robot state; end-to-end networks get both apart."""
-        ranges, state = self._checked(scan, robot_state)
+        ranges, state = self._of_now(scan, robot_state)
         if self._stream is not None and not self._stream.listens() and self.features == "h":
             # all contexts are full: nothing that the lidar sees changes h any more
             ignored = state.new_zeros(len(state), self.world_model.z_size if self.world_model is not None else 0)
@@ -462,10 +470,8 @@ class Policy:
         self._fresh[:] = False
         return h
 
-    def _checked(
-        self, scan: NDArray[Any] | Tensor, robot_state: NDArray[Any] | Tensor
-    ) -> tuple[NDArray[np.float32], Tensor]:
-        """Return ranges on the host and robot state on the device, or raise."""
+    def _checked(self, scan: NDArray[Any] | Tensor, robot_state: NDArray[Any] | Tensor) -> tuple[NDArray[Any], Tensor]:
+        """Return ranges on the host, with "nothing hit" in place of inf, and robot state on the device, or raise."""
         if self.lidar is None:
             raise PolicyError(f"{self._who()} cannot see: its encoder is not known. Use controller(features).")
         ranges = scan.detach().cpu().numpy() if isinstance(scan, Tensor) else np.asarray(scan)
@@ -477,11 +483,14 @@ class Policy:
             )
         if len(ranges) == 0:
             raise ArrayError(f"scan has shape {ranges.shape}, expected at least one row.")
-        low, high, far = ranges.min(), ranges.max(), _FAR * self.sensor.range_max
+        free, far = self.sensor.range_max, _FAR * self.sensor.range_max
+        if ranges.max() == np.inf:
+            ranges = np.where(np.isposinf(ranges), ranges.dtype.type(free), ranges)
+        low, high = ranges.min(), ranges.max()
         if not (low >= 0.0 and high <= far):  # also true of NaN
             raise ArrayError(
-                f"scan holds values from {low} to {high}, expected 0 to {self.sensor.range_max} m with "
-                f"{self.sensor.range_max} where nothing is hit: {_ADAPT}."
+                f"scan holds values from {low} to {high}, expected 0 to {far:g} m, with {free:g} or more (or inf) "
+                f"where nothing is hit: {_ADAPT}."
             )
         state = _tensor(robot_state, self.device)
         if state.shape != (len(ranges), ROBOT_STATE_SIZE) or not bool(torch.isfinite(state).all()):
@@ -489,6 +498,13 @@ class Policy:
                 f"robot_state has shape {tuple(state.shape)}, expected ({len(ranges)}, {ROBOT_STATE_SIZE}) finite "
                 "numbers: goal x, y, vx, vy, omega."
             )
+        return ranges, state
+
+    def _of_now(
+        self, scan: NDArray[Any] | Tensor, robot_state: NDArray[Any] | Tensor
+    ) -> tuple[NDArray[np.float32], Tensor]:
+        """Return a step of all robots as the networks know it, or raise."""
+        ranges, state = self._checked(scan, robot_state)
         if len(self._last) == 0 or (self.world_model is None and len(self._last) != len(ranges)):
             self.reset(batch_size=len(ranges))
         if len(self._last) != len(ranges):

@@ -181,6 +181,11 @@ def test_later_rounds_are_the_same_episodes_in_a_place_of_their_own(tmp_path):
     assert again.seconds == {"goal": 0.0}
     assert [r.first_round for r in find_benchmarks(tmp_path, "navreptest")] == [0]
     assert [r.first_round for r in find_benchmarks(tmp_path, "navreptest", first_round=5)] == [5]
+    twin = later.files[0].with_name("copy.json")
+    twin.write_bytes(later.files[0].read_bytes())
+    with pytest.raises(ConfigError, match=r"copy\.json and .*goal\.json both hold results of goal, expected one"):
+        redraw(twin.parent)
+    twin.unlink()
     moved = later.files[0].rename(whole.files[0].parent / "other.json")
     with pytest.raises(ConfigError, match="several suites, physics or first rounds"):
         redraw(moved.parent)

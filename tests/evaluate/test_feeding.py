@@ -129,7 +129,7 @@ def test_results_say_how_a_network_was_fed_in_header_name_and_file():
         "e2e_1d.20201026.scaling-none.json",
     ]
     noisy = {"inference": "as_released", "ranges": "as_released"}
-    assert result_name("x", noisy) == "x (as released, ranges as the authors fed them)"
+    assert result_name("x", noisy) == "x (noise of the release, ranges as the authors fed them)"
     assert "ranges" not in header_of(PilotSpec("goal", "goal only", "goal", "baseline"), SUITE, "original")["settings"]
 
 

@@ -264,16 +264,31 @@ def test_scans_of_another_contract_are_refused(small):
     millimetres = (good * 1000).astype(np.uint16)
     holes = good.copy()
     holes[0, 5] = np.nan
-    endless = good.copy()
-    endless[1, 7] = np.inf
-    for bad in (good[:, :720], good[0], holes, endless, -good, good * 1000, np.zeros((0, 1080), np.float32)):
-        with pytest.raises(ArrayError, match=r"ScanAdapter|at least one row"):
-            small.act(bad, state)
+    behind = good.copy()
+    behind[1, 7] = -np.inf
+    for bad in (good[:, :720], good[0], holes, behind, -good, good * 1000, np.zeros((0, 1080), np.float32)):
+        for take in (small.act, small.encode, small.look):
+            with pytest.raises(ArrayError, match=r"ScanAdapter|at least one row"):
+                take(bad, state)
+    with pytest.raises(ArrayError, match=r"expected 0 to 1000 m, with 25 or more \(or inf\) where nothing is hit"):
+        small.act(good * 1000, state)
     with pytest.raises(ArrayError, match="metres_from_millimetres"):
         small.act(millimetres, state)
     with pytest.raises(ConfigError, match=r"small_1d_z\.test takes scans with n_rays = 1080, got 720.*ScanAdapter"):
         small.check_sensor(SensorContract(n_rays=720))
     small.check_sensor(SensorContract())
+
+
+@pytest.mark.parametrize("ranges", ["contract", "as_released"])
+def test_infinite_ranges_are_rays_that_hit_nothing(small, ranges):
+    scan, state = (x[0] for x in scenes(2, 1))
+    scan[0, 5:9] = 25.0
+    endless = scan.copy()
+    endless[0, 5:9] = np.inf
+    policy = Policy(small.network, "z", "1d", small.vae, ranges=ranges)
+    for take in (policy.act, policy.encode, lambda *rows: policy.look(*rows)[0]):
+        np.testing.assert_array_equal(take(endless, state), take(scan, state))
+    assert np.isinf(endless[0, 5]), "what was given stays as it was"
 
 
 def test_other_arrays_are_refused(small, world_models):

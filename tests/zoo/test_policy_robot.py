@@ -119,10 +119,26 @@ def test_the_robot_of_training_is_written_and_read(tmp_path):
             zoo.load(tmp_path / "p")
 
 
+def test_a_second_robot_keeps_what_the_first_one_set():
+    policy = end_to_end().for_robot(max_speed=0.5).for_robot(radius=0.2)
+    assert (policy.robot, policy.trained_on) == (RobotContract(0.5, 0.2), RobotContract())
+    assert policy.for_robot().robot == policy.robot
+
+
+def test_numbers_of_numpy_are_numbers():
+    robot = RobotContract(np.float32(0.5), np.int64(1))
+    assert robot == RobotContract(0.5, 1.0)
+    assert {type(value) for value in robot.to_dict().values()} == {float}
+    assert json.loads(json.dumps(robot.to_dict())) == {"max_speed": 0.5, "radius": 1.0}
+    for wrong in (np.float32(np.nan), np.bool_(True), True, "0.5", np.array([0.5])):
+        with pytest.raises(ConfigError, match=r"max_speed is .*, expected more than 0"):
+            RobotContract(wrong)
+
+
 def test_what_cannot_be_scaled_is_refused():
     with pytest.raises(ConfigError, match="max_speed is 0, expected more than 0"):
         end_to_end().for_robot(max_speed=0)
-    with pytest.raises(ConfigError, match="ranges as released, which are not scaled"):
+    with pytest.raises(ConfigError, match="ranges as the authors fed them, which are not scaled"):
         end_to_end(ranges="as_released").for_robot(max_speed=0.5)
 
 
