@@ -236,8 +236,12 @@ def fed_as(settings: Mapping[str, Any]) -> str:
     return "as trained" if settings.get("scaling") == "none" else ""
 
 
+def noise_of(settings: Mapping[str, Any]) -> str:
+    """Return in words whether memories ran with noise, from the settings in a results file; empty where they did not."""
+    return "noise of the release" if settings.get("inference") == "as_released" else ""
+
+
 def result_name(name: str, settings: Mapping[str, Any]) -> str:
     """Return what results are called: the policy's name, and how it ran where that is not the default."""
-    noise = "noise of the release" if settings.get("inference") == "as_released" else ""
-    how = ", ".join(word for word in (noise, fed_as(settings)) if word)
+    how = ", ".join(word for word in (noise_of(settings), fed_as(settings)) if word)
     return f"{name} ({how})" if how else name

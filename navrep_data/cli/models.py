@@ -88,11 +88,13 @@ def _size(record: Record) -> str:
 
 
 def _score(results: Sequence[dict[str, Any]], suite: str) -> str:
-    """Return success in a suite's default physics, without contacts and as released."""
-    mine = [r for r in results if r.get("suite") == suite and r.get("physics") == "original"]
-    if not mine:
+    """Return success in a suite's default physics, rounds and feeding, without contacts and as released."""
+    from navrep_data.zoo.measured import main_result
+
+    mine = main_result(results, suite, "original")
+    if mine is None:
         return "-"
-    free, released = (mine[0].get(key) for key in ("contact_free_rate", "success_rate"))
+    free, released = (mine.get(key) for key in ("contact_free_rate", "success_rate"))
     return ("-" if free is None else f"{100 * free:.1f}") + ("" if released is None else f" ({100 * released:.1f}) %")
 
 

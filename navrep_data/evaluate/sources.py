@@ -14,7 +14,7 @@ from navrep_data.evaluate.suites import get_suite, suite_names
 from navrep_data.evaluate.world_model import WorldModelError
 from navrep_data.evaluate.world_model_results import FOLDER
 from navrep_data.evaluate.world_model_results import load as load_world_model
-from navrep_data.zoo import registry
+from navrep_data.zoo import measured, registry
 from navrep_data.zoo.folders import is_path, place_of
 from navrep_data.zoo.names import OWN
 from navrep_data.zoo.registry import Record
@@ -92,6 +92,8 @@ def find_world_models(folder: Path) -> list[tuple[WorldModelError, dict[str, Any
 def benchmark_entries(folder: Path, record: Record) -> list[dict[str, Any]]:
     """Return what a record says of its benchmark results below a folder, `goal` on the same episodes beside each.
 
+    An entry per suite, physics and first round, and per way in which the network was run and fed.
+
     Raises
     ------
     DatasetMismatchError
@@ -103,16 +105,15 @@ def benchmark_entries(folder: Path, record: Record) -> list[dict[str, Any]]:
     for suite in suite_names():
         for physics in ("original", "consistent"):
             for first_round in _first_rounds(folder, suite, physics):
-                found = {r.name: r for r in find_benchmarks(folder, suite, physics, first_round)}
-                mine = found.get(record.name)
-                if mine is None:
-                    continue
-                _same_weights(mine.header["settings"]["policy_files"], record, str(folder))
-                if "goal" not in found:
-                    raise CorruptDataError(
-                        f"{folder} has no results of 'goal' in {suite}, expected them beside every score."
-                    )
-                entries.append(_entry(mine, found["goal"], record))
+                found = find_benchmarks(folder, suite, physics, first_round)
+                goal = next((r for r in found if r.header["name"] == "goal"), None)
+                for mine in (r for r in found if r.header["name"] == record.name):
+                    _same_weights(mine.header["settings"]["policy_files"], record, str(folder))
+                    if goal is None:
+                        raise CorruptDataError(
+                            f"{folder} has no results of 'goal' in {suite}, expected them beside every score."
+                        )
+                    entries.append(_entry(mine, goal, record))
     return entries
 
 
@@ -131,35 +132,48 @@ def _same_weights(files: dict[str, str], record: Record, where: str) -> None:
 
 
 def _entry(mine: Results, goal: Results, record: Record) -> dict[str, Any]:
-    row, suite = summary(mine), mine.suite
+    row = summary(mine)
     played = [k for k in range(len(mine.outcome)) if mine.outcome[k] != "-"]
-    command = f"navrep-data benchmark {record.name} --suite {suite.name}"
-    if mine.physics != suite.physics:
-        command += f" --physics {mine.physics}"
-    rounds = row["episodes"] / len(suite.scenarios)
-    if rounds != suite.rounds:
-        command += f" --episodes {rounds:g}"
-    if mine.first_round:
-        command += f" --first-round {mine.first_round}"
     shares = [f"{name}_rate{end}" for name in SUCCESSES for end in ("", "_low", "_high")]
     beside = score(goal, played)
     entry: dict[str, Any] = {
-        "suite": suite.name,
+        "suite": mine.suite.name,
         "physics": mine.physics,
         "episodes": row["episodes"],
         "rounds": row["rounds"],
+        **_how(mine),
         **{key: round(row[key], 6) for key in (*shares, "collision_rate", "timeout_rate")},
         **{
             key: None if row[key] is None else round(row[key], 6) for key in ("contacts_per_km", "personal_space_share")
         },
         **{f"goal_{name}_rate": round(beside[f"{name}_rate"], 6) for name in SUCCESSES},
-        "command": command,
+        "command": _command(mine, row["episodes"], record),
     }
     if "per_map" in row:
         parts = {"per_map_contact_free": "contact_free_rate", "per_map": "success_rate"}
         for key, share in parts.items():
             entry[key] = {name: round(part[share], 6) for name, part in row["per_map"].items()}
     return entry
+
+
+def _how(results: Results) -> dict[str, str]:
+    """Return how a network was run and fed."""
+    return {name: results.header["settings"].get(name, usual) for name, usual in measured.HOW.items()}
+
+
+def _command(mine: Results, episodes: int, record: Record) -> str:
+    """Return the command that gives these results, with every setting that is not the default."""
+    suite, rounds, how = mine.suite, episodes / len(mine.suite.scenarios), _how(mine)
+    if how["ranges"] == "as_released":  # never scaled
+        how["scaling"] = measured.HOW["scaling"]
+    given = {
+        "physics": (mine.physics, suite.physics),
+        "episodes": (f"{rounds:g}", f"{suite.rounds:g}"),
+        "first-round": (str(mine.first_round), "0"),
+        **{name: (value, measured.HOW[name]) for name, value in how.items()},
+    }
+    options = [f"--{name} {value}" for name, (value, usual) in given.items() if value != usual]
+    return " ".join([f"navrep-data benchmark {record.name} --suite {suite.name}", *options])
 
 
 def world_model_entries(folder: Path, record: Record) -> list[dict[str, Any]]:

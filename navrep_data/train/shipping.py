@@ -26,7 +26,7 @@ from navrep_data.train import state
 from navrep_data.train.half import Rounding, rounding
 from navrep_data.train.logs import read_log
 from navrep_data.train.modular import WORLD_MODEL
-from navrep_data.zoo import registry
+from navrep_data.zoo import measured, registry
 from navrep_data.zoo.local import PARTS, POLICY_FILE, load_policy
 from navrep_data.zoo.names import OWN, SHIPPED_BYTES, UNTAGGED_ARE_OURS
 from navrep_data.zoo.policy import Policy
@@ -324,7 +324,8 @@ def add_results(name: str, results: Path | str, *, root: Path | None = None) -> 
     Returns
     -------
     Record
-        As written; what the folder has replaces earlier results of the same suite and physics.
+        As written; what the folder has replaces earlier results of the same suite, physics and first round that were
+        fed in the same way, and stands beside all others.
 
     Raises
     ------
@@ -342,17 +343,11 @@ def add_results(name: str, results: Path | str, *, root: Path | None = None) -> 
         raise ConfigError(
             f"{results} has no results of {record.name}: run navrep-data benchmark {record.name} --out DIR"
         )
-    old = {_key(entry): entry for entry in record.results}
-    merged = [*(old | {_key(entry): entry for entry in found}).values()]
     path = root / registry.RECORDS / f"{record.name}.json"
-    atomic_write_json(path, {**record.to_dict(), "results": merged})
+    atomic_write_json(path, {**record.to_dict(), "results": measured.merged(record.results, found)})
     for cached in (registry.records, registry.variants, registry.full_names):
         cached.cache_clear()
     return registry.find(name)
-
-
-def _key(entry: dict[str, Any]) -> tuple[str, ...]:
-    return tuple(str(entry.get(key)) for key in ("suite", "physics", "split"))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -368,9 +363,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     weights.add_argument("--command", action="append", default=[], help="a command that made it; once for each")
     weights.add_argument("--before", type=Path, action="append", default=[], help="V's folder, or an earlier stage's")
     weights.add_argument("--world-model", metavar="NAME")
-    measured = verbs.add_parser("results", help="what was measured -> record")
-    measured.add_argument("name")
-    measured.add_argument("--results", type=Path, required=True)
+    results = verbs.add_parser("results", help="what was measured -> record")
+    results.add_argument("name")
+    results.add_argument("--results", type=Path, required=True)
     given = parser.parse_args(arguments)
     if given.verb == "weights":
         record = ship(

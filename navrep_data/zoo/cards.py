@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data.zoo._markdown import table
+from navrep_data.zoo.measured import episodes, feeding, is_benchmark, played, share
 from navrep_data.zoo.names import OWN, RELEASED, RELEASED_RULE, default_tag
-from navrep_data.zoo.own_cards import is_benchmark, own_card, share
+from navrep_data.zoo.own_cards import own_card, world_model_errors
 from navrep_data.zoo.registry import Record, dependants, records, variants
 
 _ARCHITECTURES = {
@@ -190,7 +191,7 @@ def _result_words(x: dict[str, Any]) -> str:
         ahead = "" if x["scan_mse"] is None else f"next frame {x['scan_mse']:.4g}, goal {x['goal_mse']:.4g} m2, "
         return f"MSE, {x['split']} split, {x['rows']:,} rows: {ahead}V {x['reconstruction_mse']:.4g}; {x['command']}"
     return (
-        f"{x['suite']} ({x['physics']} physics, {x['episodes']} episodes): success contact-free "
+        f"{played(x)}: success contact-free "
         f"{share(x, 'contact_free_rate')}, as released {share(x, 'success_rate')}; `goal` on the same episodes "
         f"{share(x, 'goal_contact_free_rate')} and {share(x, 'goal_success_rate')}; {x['command']}"
     )
@@ -242,16 +243,19 @@ def _runs_table(runs: Sequence[Record]) -> str:
 
 def _results(runs: Sequence[Record]) -> str:
     rows = [
-        (f"`{r.name}`", f"{x['suite']}, {x['physics']} physics", x["episodes"], share(x, "contact_free_rate"),
+        (f"`{r.name}`", x["suite"], x["physics"], episodes(x), feeding(x), share(x, "contact_free_rate"),
          share(x, "success_rate"), f"{share(x, 'goal_contact_free_rate')} / {share(x, 'goal_success_rate')}",
          f"`{x['command']}`")
         for r in runs
         for x in r.results
+        if is_benchmark(x)
     ]  # fmt: skip
+    errors = [text for r in runs for text in world_model_errors(r)]
     if not rows:
-        return "Not measured yet."
-    head = ("run", "suite", "episodes", "success, contact-free", "success, as released")
-    return table((*head, "`goal` on the same episodes, both", "command"), rows)
+        return "\n\n".join(errors) or "Not measured yet."
+    head = ("run", "suite", "physics", "episodes (rounds)", "feeding", "success, contact-free", "success, as released")
+    scores = table((*head, "`goal` on the same episodes, both", "command"), rows)
+    return "\n\n".join([scores, *errors])
 
 
 def _parts(runs: Sequence[Record]) -> str:

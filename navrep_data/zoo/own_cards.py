@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from navrep_data.zoo._markdown import table
+from navrep_data.zoo.measured import episodes, feeding, is_benchmark, played, share
 from navrep_data.zoo.names import RELEASED
 from navrep_data.zoo.registry import Record, dependants
 from navrep_data.zoo.stages import stages_table, supervision
@@ -17,7 +18,7 @@ _LOOKED = (
 )
 _BLIND_PEOPLE = "In its training worlds about half of the people do not see the robot and walk into it."
 _BENCHMARK_HEAD = (
-    "suite", "physics", "episodes (rounds)", "success, contact-free (95 % interval)", "success, as released",
+    "suite", "physics", "episodes (rounds)", "feeding", "success, contact-free (95 % interval)", "success, as released",
     "`goal` on the same episodes, both", "collision", "timeout", "contacts per km", "command",
 )  # fmt: skip
 _WORLD_MODEL_HEAD = (
@@ -26,24 +27,11 @@ _WORLD_MODEL_HEAD = (
 )  # fmt: skip
 
 
-def is_benchmark(entry: dict[str, Any]) -> bool:
-    """Return whether a result is a share of episodes, and not a world-model error."""
-    return "success_rate" in entry
-
-
-def share(entry: dict[str, Any], key: str, interval: bool = False) -> str:
-    """Return a share of a result in percent, "-" where it was not measured: contacts were not always recorded."""
-    if entry.get(key) is None:
-        return "-"
-    text = f"{entry[key]:.1%}"
-    return f"{text} ({entry[f'{key}_low']:.1%} to {entry[f'{key}_high']:.1%})" if interval else text
-
-
 def results(r: Record) -> str:
     """Return the tables of a record's results, each with command and baseline."""
     scores = [
         (
-            x["suite"], x["physics"], f"{x['episodes']} ({x['rounds']})" if "rounds" in x else x["episodes"],
+            x["suite"], x["physics"], episodes(x), feeding(x),
             share(x, "contact_free_rate", interval=True), share(x, "success_rate", interval=True),
             f"{share(x, 'goal_contact_free_rate')} / {share(x, 'goal_success_rate')}",
             share(x, "collision_rate"), share(x, "timeout_rate"), _number(x.get("contacts_per_km")),
@@ -52,6 +40,17 @@ def results(r: Record) -> str:
         for x in r.results
         if is_benchmark(x)
     ]  # fmt: skip
+    parts = [table(_BENCHMARK_HEAD, scores)] if scores else []
+    for x in r.results:
+        for key, what in (("per_map_contact_free", "contact-free"), ("per_map", "as released")):
+            if key in x:
+                shares = ", ".join(f"{name} {value:.1%}" for name, value in x[key].items())
+                parts.append(f"Per map, {what} ({played(x)}): {shares}.")
+    return "\n\n".join([*parts, *world_model_errors(r)]) or "Not measured yet."
+
+
+def world_model_errors(r: Record) -> list[str]:
+    """Return the table of a record's world-model errors with their dataset, nothing where there are none."""
     errors = [
         (
             x["split"], f"{x['rows']:,}", _number(x["scan_mse"]), _number(x["still_scan_mse"]), _number(x["goal_mse"]),
@@ -60,17 +59,11 @@ def results(r: Record) -> str:
         for x in r.results
         if not is_benchmark(x)
     ]  # fmt: skip
-    parts = [table(_BENCHMARK_HEAD, scores)] if scores else []
-    for x in r.results:
-        for key, what in (("per_map_contact_free", "contact-free"), ("per_map", "as released")):
-            if key in x:
-                shares = ", ".join(f"{name} {value:.1%}" for name, value in x[key].items())
-                parts.append(f"{x['suite']} per map, {what}: {shares}.")
-    if errors:
-        data = sorted({f"{x['data']['name']} (content hash `{x['data']['content_hash'][:16]}`)" for x in r.results
-                       if not is_benchmark(x)})  # fmt: skip
-        parts += [table(_WORLD_MODEL_HEAD, errors), f"DIR: {'; '.join(data)}."]
-    return "\n\n".join(parts) or "Not measured yet."
+    if not errors:
+        return []
+    data = sorted({f"{x['data']['name']} (content hash `{x['data']['content_hash'][:16]}`)" for x in r.results
+                   if not is_benchmark(x)})  # fmt: skip
+    return [table(_WORLD_MODEL_HEAD, errors), f"DIR: {'; '.join(data)}."]
 
 
 def _number(value: float | None) -> str | None:
