@@ -276,7 +276,22 @@ class WorldGroups(WorldBatch):
         self._pool.shutdown()
 
 
-def play(policy: Policy, config: SimConfig, numpy_seeds: Sequence[int]) -> list[Event]:
+class Ending(NamedTuple):
+    """How an episode ended.
+
+    Attributes
+    ----------
+    event : Event
+        By the rules of the environment; in original physics a goal outranks a collision of the same step.
+    touched : bool
+        Whether the robot touched anybody or anything on the way, see :meth:`navrep_data.sim.Simulator.touches`.
+    """
+
+    event: Event
+    touched: bool
+
+
+def play(policy: Policy, config: SimConfig, numpy_seeds: Sequence[int]) -> list[Ending]:
     """Let a policy drive numbered episodes, side by side, each to its end.
 
     Parameters
@@ -290,7 +305,7 @@ def play(policy: Policy, config: SimConfig, numpy_seeds: Sequence[int]) -> list[
 
     Returns
     -------
-    list of Event
+    list of Ending
         How each ended.
     """
     n = len(numpy_seeds)
@@ -298,7 +313,7 @@ def play(policy: Policy, config: SimConfig, numpy_seeds: Sequence[int]) -> list[
     simulator.reset_seeded(np.asarray(numpy_seeds))
     policy.reset(batch_size=n)
     see = eyes(config, policy)
-    ended = np.zeros(n, np.uint8)
+    ended, touched = np.zeros(n, np.uint8), np.zeros(n, np.bool_)
     most = int(np.ceil(config.time_limit / config.sensor.dt)) + 2
     for _ in range(most):
         scan, state = simulator.observe()
@@ -306,7 +321,9 @@ def play(policy: Policy, config: SimConfig, numpy_seeds: Sequence[int]) -> list[
         command = velocity_commands(config, (action.numpy() if isinstance(action, Tensor) else action)[:, :N_ACTIONS])
         policy.observe(command)
         _, events = simulator.step(np.where((ended == 0)[:, None], command, 0.0))
+        touches = simulator.touches()
+        touched |= (ended == 0) & (touches.agents.any(axis=1) | touches.matter)
         ended = np.where(ended == 0, events, ended)
         if (ended != 0).all():
             break
-    return [Event(int(e)) for e in ended]
+    return [Ending(Event(int(e)), bool(t)) for e, t in zip(ended, touched, strict=True)]
