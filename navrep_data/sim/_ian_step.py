@@ -171,22 +171,27 @@ def _hits_wall(agents, walkers, i, maps, map_row, rules):
 
 
 @kernel
-def _note_touches(agents, circles, n):
-    """Write which other agents the first robot touches, before anybody is put back; a robot's pairs never pass."""
+def _note_touches(agents, walkers, circles, n, maps, map_row, rules):
+    """Write what the first robot touches, before anybody is put back; the map's edge counts as static matter.
+
+    A robot's pairs never pass.
+    """
     for j in range(1, n):
         vx, vy = agents[j, A_VX] - agents[0, A_VX], agents[j, A_VY] - agents[0, A_VY]
         note_touch(agents, j, touches(agents, circles, 0, j), vx, vy)
+    matter = walkers[0, W_LEFT] != 0.0 or _hits_wall(agents, walkers, 0, maps, map_row, rules)
+    note_touch(agents, 0, matter, agents[0, A_VX], agents[0, A_VY])
 
 
 @kernel
 def _collide(agents, walkers, contacts, circles, n, maps, map_row, rules):
     """Find the step's collisions in the original's order; those who collide take damage and are put back.
 
-    For each agent in turn: the first other of a higher number whose body it touches, then static matter. The map's edge
-    counts as static matter for what the first robot touches.
+    For each agent in turn: the first other of a higher number whose body it touches, then static matter, where it is
+    by then: who was put back from another meets the wall no more.
     """
     robots = int(rules[R_ROBOTS])
-    _note_touches(agents, circles, n)
+    _note_touches(agents, walkers, circles, n, maps, map_row, rules)
     for i in range(n):
         walkers[i, W_HIT] = NONE
     for i in range(n):
@@ -201,10 +206,7 @@ def _collide(agents, walkers, contacts, circles, n, maps, map_row, rules):
                 put_back(agents, walkers, i)
                 put_back(agents, walkers, j)
             break
-        wall = _hits_wall(agents, walkers, i, maps, map_row, rules)
-        if i == 0:
-            note_touch(agents, 0, wall or walkers[0, W_LEFT] != 0.0, agents[0, A_VX], agents[0, A_VY])
-        if wall:
+        if _hits_wall(agents, walkers, i, maps, map_row, rules):
             damage = np.hypot(agents[i, A_VX], agents[i, A_VY])
             walkers[i, W_DAMAGE] += damage
             walkers[i, W_DAMAGE_STATIC] += damage

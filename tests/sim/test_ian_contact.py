@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from navrep_data.sim import _ian_contact
+from navrep_data.sim import _ian_contact, _ian_step
 from navrep_data.sim import _ian_layout as il
+from navrep_data.sim import _layout as lay
+from navrep_data.sim._judge import COLLISION_HUMAN
 
 
 def tables(solid: np.ndarray, resolution: float, x0: float, y0: float) -> tuple[il.MapTables, np.ndarray]:
@@ -60,3 +62,25 @@ def test_swept_distance_equals_dense_sampling(share: float) -> None:
                     assert wanted - np.hypot(*(b - a)) / 399 - 1e-12 <= seen <= wanted + 1e-9
                 else:
                     assert reach - 1e-9 <= seen <= wanted + 1e-9
+
+
+@pytest.mark.parametrize("original", [0.0, 1.0])
+def test_a_wall_touched_together_with_somebody_is_noted_where_the_robot_got_to(original):
+    """The other puts the robot back, so that the wall does no damage; it was touched all the same."""
+    solid = np.zeros((30, 20), bool)
+    solid[20:] = True
+    maps, row = tables(solid, 0.1, 0.0, 0.0)
+    agents, walkers = np.zeros((2, lay.AGENT_FIELDS)), np.zeros((2, il.WALKER_FIELDS))
+    agents[0, [lay.A_X, lay.A_Y, lay.A_VX, lay.A_RADIUS]] = 1.85, 1.0, 0.5, 0.3
+    agents[1, [lay.A_X, lay.A_Y, lay.A_RADIUS]] = 1.2, 1.5, 0.3
+    walkers[0, [il.W_LAST_X, il.W_LAST_Y]] = 1.5, 1.0
+    walkers[1, [il.W_LAST_X, il.W_LAST_Y]] = 1.2, 1.5
+    circles = np.zeros((4, 4))
+    circles[:2, :3], circles[2:, :3] = (1.85, 1.0, 0.3), (1.85, 1.35, 0.1)
+    rules = np.zeros(il.RULE_FIELDS)
+    rules[[il.R_ROBOTS, il.R_BOUNCE, il.R_ORIGINAL]] = 1.0, 1.0, original
+    _ian_step._collide(agents, walkers, np.zeros((2, 2), np.int8), circles, 2, maps, row, rules)
+    assert agents[:, lay.A_TOUCHED].tolist() == [1.0, 1.0]
+    assert agents[:, lay.A_TOUCH_SPEED].tolist() == [0.5, 0.5]
+    assert walkers[0, [il.W_HIT, il.W_DAMAGE, il.W_DAMAGE_STATIC]].tolist() == [COLLISION_HUMAN, 0.5, 0.0]
+    assert agents[0, [lay.A_X, lay.A_Y]].tolist() == [1.5, 1.0]
