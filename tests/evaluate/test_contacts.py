@@ -18,7 +18,7 @@ from navrep_data.evaluate.scores import compare, score, summary
 from navrep_data.evaluate.sources import find_benchmarks
 from navrep_data.evaluate.statistics import bootstrap_ratio
 from navrep_data.schema import Event
-from navrep_data.sim import Simulator, make_config
+from navrep_data.sim import Simulator, make_config, scale_actions
 from navrep_data.sim import _layout as lay
 
 
@@ -82,36 +82,76 @@ def test_every_collision_in_polygon_worlds_is_one_contact_and_nothing_else_is(ph
                 assert e.contacts.human >= 1
 
 
+def straight(scan, robot_state):
+    """Drive straight to the goal, into whatever stands in the way."""
+    goal = np.asarray(robot_state, np.float64)[:, :2]
+    return goal / np.maximum(np.abs(goal).max(axis=1, keepdims=True), 1e-9)
+
+
+def gap_to_matter(grid, way):
+    """Return the smallest distance of the points (k, 2) of a way to squares of solid cells and the map's edge [m]."""
+    low, cell = np.array(grid.origin), grid.resolution
+    high = low + np.array(grid.shape) * cell
+    first = np.maximum(np.floor((way.min(axis=0) - 1.0 - low) / cell).astype(int), 0)
+    last = np.floor((way.max(axis=0) + 1.0 - low) / cell).astype(int) + 1
+    corners = low + (first + np.argwhere(grid.occupied[first[0] : last[0], first[1] : last[1]])) * cell
+    outside = np.maximum(np.maximum(corners[:, None] - way, way - corners[:, None] - cell), 0.0)
+    rim = min((way - low).min(), (high - way).min())
+    return max(min(np.hypot(*np.moveaxis(outside, -1, 0)).min(initial=1.0), rim), 0.0)
+
+
+def touches_matter(grid, physics, before, after, radius):
+    """Say whether a robot that moved from one place to the other met matter, by the words of docs/differences.md."""
+    if physics == "original":  # the cell of its centre against the centres of solid cells
+        place = ((after.astype(np.float32) - np.float32(grid.origin)) / np.float32(grid.resolution)).astype(int)
+        apart = np.hypot(*(np.argwhere(grid.occupied) - place).T).min() * grid.resolution
+        return bool(apart < radius or not grid.free[tuple(place)])
+    gap = gap_to_matter(grid, np.linspace(before, after, 50))
+    return gap < radius and gap < gap_to_matter(grid, before[None]) - 1e-9
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("physics", ["original", "consistent"])
-def test_on_maps_damage_comes_with_contact_and_contacts_are_those_of_a_plain_loop(physics, maps):
+def test_on_maps_contacts_are_those_of_legs_and_cells_in_plain_numpy(physics, maps):
+    """Everything that the robot meets is worked out from where the simulator put legs, and the cells of the map."""
     episodes = (0, 5, 9, 14)
-    found = {
-        e.episode: e
-        for finished in run(Job("navrep27", physics, resolve_policy("goal"), episodes), 1)
-        for e in finished
-    }  # fmt: skip
+    job = Job("navrep27", physics, resolve_policy(straight), episodes)
+    found = {e.episode: e for finished in run(job, 1) for e in finished}
+    met = set()
     for k in episodes:
         sim = Simulator(make_config("ian", physics=physics))
         sim.reset_scenarios([k % 27], [k])
-        before, runs, damage, event = set(), 0, 0.0, 0
+        grid = sim.maps.data.maps[int(sim.arrays.worlds.place[0, 0])]
+        agents = sim.arrays.agents[0]
+        there = 1 + int(sim.arrays.scalars[0, lay.S_HUMANS])
+        before, people, matter, damage, event = set(), 0, 0, 0.0, 0
         while not event:
-            x, y = sim.observe()[1][0, :2].astype(float)
-            scale = 0.55 / max(abs(x), abs(y), 1e-9)
-            action = np.array([x * scale, y * scale])
-            action *= min(1.0, 0.55 / np.hypot(*action))
-            _, (event,) = sim.step([[*action, 0.0]])
-            touch = sim.touches()
-            now = {int(j) for j in np.flatnonzero(touch.agents[0])} | ({-1} if touch.matter[0] else set())
-            runs += len(now - before)
+            (x, y, heading), radius = agents[0, [lay.A_X, lay.A_Y, lay.A_HEADING]], agents[0, lay.A_RADIUS]
+            (vx, vy, omega), c, s = (
+                scale_actions(sim.config, straight(*sim.observe()))[0],
+                np.cos(heading),
+                np.sin(heading),
+            )
+            _, (event,) = sim.step([[vx, vy, omega]])
+            start = np.array([x, y])
+            end = start + sim.config.sensor.dt * np.array([c * vx - s * vy, s * vx + c * vy])
+            # two legs a body, as they stood before anybody was put back
+            legs = sim.arrays.circles[: 2 * there, :3].reshape(there, 2, 3)
+            np.testing.assert_allclose(legs[0, :, :2].mean(axis=0), end, rtol=0, atol=1e-9)
+            reach = np.hypot(*np.moveaxis(legs[:, :, :2] - end, -1, 0)) < radius + legs[:, :, 2]
+            now = {int(j) for j in np.flatnonzero(reach.any(axis=1)) if j > 0}
+            if touches_matter(grid, physics, start, end, radius):
+                now.add(0)
+            people += len(now - before - {0})
+            matter += 0 in now - before
             before = now
             taken = sim.damage()[0, 0]
             assert now or taken == damage, "damage without a touch"
             damage = taken
-        if event in (Event.COLLISION_HUMAN, Event.COLLISION_OBSTACLE):
-            assert found[k].contacts.total > 0
-        if (found[k].steps, found[k].event) == (int(sim.state().step), Event(event)):
-            assert found[k].contacts.total == runs
+        assert (found[k].steps, found[k].event) == (int(sim.state().step), Event(event))
+        assert (found[k].contacts.human, found[k].contacts.obstacle) == (people, matter), k
+        met |= {name for name, n in (("people", people), ("matter", matter)) if n}
+    assert met == {"people", "matter"}
 
 
 def made_up(name, outcome, touched=(), suite="navreptest"):
