@@ -222,8 +222,7 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._scan is None:
             raise gymnasium.error.ResetNeeded("There is nothing to draw before the first reset().")
         state, grid = self._worlds.sim.state(), self._worlds.grid(0)
-        if self._camera is None:
-            self._camera = Camera.around(state, grid)
+        self._camera = Camera.around(state, grid) if self._camera is None else self._camera.following(state, grid)
         return draw_frame(state, self._camera, self._scan, self.config.sensor, self._trail, grid, size)
 
     def render(self) -> NDArray[np.uint8] | None:

@@ -324,7 +324,8 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
             scan = self._worlds.observe(np.arange(self.num_envs) == world)["scan"][world]
         camera = self._cameras[world]
         if camera is None or self.render_mode is None:
-            camera = self._cameras[world] = Camera.around(state, grid)
+            camera = Camera.around(state, grid)
+        camera = self._cameras[world] = camera.following(state, grid)
         return draw_frame(state, camera, scan, self.config.sensor, self._trails[world], grid, size)
 
     def state(self, world: int) -> WorldState:

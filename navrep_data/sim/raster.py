@@ -59,18 +59,63 @@ class Camera:
     def around(cls, state: WorldState, grid: GridMap | None = None) -> Camera:
         """Return the camera that shows a world's obstacles, border, robots, humans and goals.
 
-        On a map: all of a small one, of others the part around them, with some metres to all sides.
+        On a map: all of a small one, of others the part around them, with some metres to all sides. Where that comes
+        near an edge of the map it goes on to there, so that no wall at an edge is cut.
         """
         points = [state.robots[:, 0:2], state.robots[:, 3:5], state.humans[:, 0:2], state.humans[:, 5:7]]
         everything = np.concatenate([*points, *(state.polygons if grid is None else [])])
         low, high = everything.min(axis=0), everything.max(axis=0)
-        if grid is not None:
-            low, high = low - _MAP_MARGIN, high + _MAP_MARGIN
-            left, right, bottom, top = grid.extent
-            if max(right - left, top - bottom) <= _WHOLE_MAP:
-                low, high = np.array([left, bottom]), np.array([right, top])
-        x, y = (low + high) / 2
-        return cls(float(x), float(y), max(_LEAST_HALF, float((high - low).max()) / 2 + _MARGIN))
+        if grid is None:
+            return cls(*_floats((low + high) / 2), _half(low, high))
+        first, last = _corners(grid)
+        if (last - first).max() <= _WHOLE_MAP:
+            return cls(*_floats((first + last) / 2), _half(first, last))
+        low, high = low - _MAP_MARGIN, high + _MAP_MARGIN
+        seen_low, seen_high = low, high
+        for _ in range(5):  # the square shows more than was asked for, which may bring it near another edge, four times
+            low = np.where(seen_low < first + _MAP_MARGIN, first, low)
+            high = np.where(seen_high > last - _MAP_MARGIN, last, high)
+            half = _half(low, high)
+            centre = _kept_on(first, last, (low + high) / 2, half)
+            seen_low, seen_high = centre - half, centre + half
+        return cls(*_floats(centre), half)
+
+    def following(self, state: WorldState, grid: GridMap | None = None) -> Camera:
+        """Return the camera that shows the first robot, too: this one, or moved by as little as that takes.
+
+        Only maps are larger than a picture; walls at their edges are shown whole or not at all.
+        """
+        if grid is None:
+            return self
+        now, robot, (first, last) = np.array([self.x, self.y]), state.robots[0, 0:2], _corners(grid)
+        room = max(self.half - _MAP_MARGIN, 0.0)
+        centre = _kept_on(first, last, now.clip(robot - room, robot + room), self.half)
+        if np.allclose(centre, now, rtol=0.0, atol=1e-9):
+            return self
+        small = 2 * (self.half - _MARGIN) >= last - first
+        centre = np.where(~small & (centre - self.half < first + _MAP_MARGIN), first - _MARGIN + self.half, centre)
+        centre = np.where(~small & (centre + self.half > last - _MAP_MARGIN), last + _MARGIN - self.half, centre)
+        return Camera(*_floats(centre), self.half)
+
+
+def _half(low: F64, high: F64) -> float:
+    return max(_LEAST_HALF, float((high - low).max()) / 2 + _MARGIN)
+
+
+def _floats(centre: F64) -> tuple[float, float]:
+    return float(centre[0]), float(centre[1])
+
+
+def _corners(grid: GridMap) -> tuple[F64, F64]:
+    left, right, bottom, top = grid.extent
+    return np.array([left, bottom]), np.array([right, top])
+
+
+def _kept_on(first: F64, last: F64, centre: F64, half: float) -> F64:
+    """Return the centre nearest to `centre` from which a square shows no more than a margin beyond the map."""
+    low, high = first - _MARGIN + half, last + _MARGIN - half
+    kept: F64 = np.where(low >= high, (first + last) / 2, np.minimum(np.maximum(centre, low), high))
+    return kept
 
 
 class Canvas:

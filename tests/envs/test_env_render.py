@@ -6,7 +6,7 @@ import types
 import matplotlib
 import numpy as np
 import pytest
-from PIL import Image, ImageColor
+from PIL import Image, ImageColor, ImageDraw
 
 matplotlib.use("Agg")
 from env_cases import make, same
@@ -95,6 +95,43 @@ def test_small_maps_are_shown_whole_and_large_ones_in_part(tmp_path, side, whole
     assert (camera.half >= side / 2) == whole
     everybody = np.concatenate([state.robot[None, :2], state.robot[None, 3:5], state.humans[:, :2]])
     assert (np.abs(everybody - [camera.x, camera.y]) <= camera.half).all()
+
+
+@pytest.mark.parametrize(("width", "height"), [(12.0, 12.0), (30.0, 20.0), (60.0, 10.0), (45.0, 45.0)])
+def test_walls_at_the_border_of_own_maps_are_whole_or_out_of_sight_and_the_robot_is_in_sight(tmp_path, width, height):
+    """The pictures of whole episodes, wherever the robot drives: where a picture ends there is no wall."""
+    cells, rng = 10, np.random.default_rng(1)
+    image = Image.new("L", (round(width * cells), round(height * cells)), 254)
+    ImageDraw.Draw(image).rectangle((0, 0, image.width - 1, image.height - 1), outline=0, width=4)
+    image.save(tmp_path / "m.png")
+    (tmp_path / "m.yaml").write_text(
+        f"image: m.png\nresolution: {1 / cells}\norigin: [-3, 2, 0]\nnegate: 0\noccupied_thresh: 0.65\n"
+        "free_thresh: 0.196\n"
+    )
+    env = NavRepEnv("map", maps=(str(tmp_path),), humans=2)
+    in_part = False
+    for seed in range(6):
+        env.reset(seed=seed)
+        left, right, bottom, top = env._worlds.grid(0).extent
+        for _ in range(4):
+            frame, camera = env.frame(400), env._camera
+            x, y = env._worlds.sim.state().robot[:2]
+            assert same(at(frame, camera, x, y), colour(drawing.ROBOT))
+            low, high = np.array([camera.x, camera.y]) - camera.half, np.array([camera.x, camera.y]) + camera.half
+            # each wall of 0.4 m with a margin beyond it, or some metres without a wall
+            gaps = np.array([left - low[0], bottom - low[1], high[0] - right, high[1] - top])
+            assert ((gaps >= 0.5 - 1e-6) | (gaps <= -2.0 + 1e-6)).all(), (seed, camera)
+            in_part |= bool((gaps < 0).any())
+            if low[0] < left:
+                column = round((left + 0.2 - low[0]) * 400 / (2 * camera.half) - 0.5)
+                row = round((high[1] - min(top - 1.0, max(bottom + 1.0, camera.y))) * 400 / (2 * camera.half) - 0.5)
+                wall = frame[row, max(column - 2, 0) : column + 3].astype(int).sum(axis=1)
+                assert wall.min() < 500, "the wall, or ends of rays on it, is drawn"
+                assert frame[row, 0].astype(int).sum() > 700, "and ends before the picture does"
+            place = [rng.uniform(left + 1, right - 1), rng.uniform(bottom + 1, top - 1)]
+            env._worlds.sim.arrays.agents[0, 0, :2] = place  # as if it had driven there
+            env._trail = []
+    assert in_part == (width > 26.0)
 
 
 def test_map_cells_are_painted_where_they_are():
