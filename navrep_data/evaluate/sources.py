@@ -22,6 +22,7 @@ from navrep_data.zoo.registry import Record
 SOURCES = {
     "authors": "authors' own figure",
     "released": "released weights, measured by us",
+    "released_as_fed": "released weights, ranges as the authors fed them, measured by us",
     "ours": "our weights, measured by us",
     "baseline": "baseline, measured by us",
     "other": "other, measured by us",
@@ -57,6 +58,13 @@ def source_of(name: str) -> str:
     if variant in registry.variants():
         return "ours" if tag == OWN else "released"
     return "other"
+
+
+def source_of_results(results: Results) -> str:
+    """Return the source of results: that of the name, and apart from it what was fed as the authors' software does."""
+    source = source_of(results.header["name"])
+    uncut = results.header["settings"].get("ranges") == "as_released"
+    return "released_as_fed" if source == "released" and uncut else source
 
 
 def find_benchmarks(folder: Path, suite: str, physics: str = "original", first_round: int = 0) -> list[Results]:

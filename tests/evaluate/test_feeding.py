@@ -5,6 +5,7 @@ import pytest
 
 from navrep_data.errors import ConfigError
 from navrep_data.evaluate import get_suite
+from navrep_data.evaluate.metrics import Contacts
 from navrep_data.evaluate.pilots import FunctionPilot, ZooPilot
 from navrep_data.evaluate.policies import PilotSpec, resolve_policy
 from navrep_data.evaluate.reproduce.testing import scores
@@ -133,14 +134,15 @@ def test_results_say_how_a_network_was_fed_in_header_name_and_file():
     assert "ranges" not in header_of(PilotSpec("goal", "goal only", "goal", "baseline"), SUITE, "original")["settings"]
 
 
-def test_beside_the_authors_numbers_stand_runs_fed_as_theirs():
+def test_runs_fed_as_the_authors_do_it_are_a_source_of_their_own():
     found = []
     for how, letters in (({}, "SS"), ({"ranges": "as_released"}, "SC"), ({"scaling": "none"}, "CC")):
         results = Results(header_of(resolve_policy("e2e_1d.20201026", **how), SUITE, "original"))
-        results.outcome = list(letters)
+        results.outcome, results.contacts = list(letters), [Contacts()] * 2
         found.append(results)
-    assert scores(found)["e2e_1d"]["released"]["all"]["value"] == 0.5
-    assert scores(found[:1])["e2e_1d"]["released"]["all"]["value"] == 1.0
+    rates = {source: of["all"]["success_rate"] for source, of in scores(found)["e2e_1d"].items()}
+    assert rates == {"released": 1.0, "released_as_fed": 0.5}
+    assert set(scores(found[:1])["e2e_1d"]) == {"released"}
     assert scores(found[2:]) == {}
 
 

@@ -17,6 +17,7 @@ from navrep_data.evaluate.reproduce import FIGURES, reproduce
 from navrep_data.evaluate.reproduce.drawn import authors
 from navrep_data.evaluate.reproduce.testing import PARTS, scores
 from navrep_data.evaluate.results import Results, file_name, header_of
+from navrep_data.evaluate.scores import SUCCESSES
 from navrep_data.evaluate.sources import find_benchmarks, source_of
 from navrep_data.evaluate.suites import get_suite
 from navrep_data.evaluate.world_model import WorldModelError
@@ -24,9 +25,9 @@ from navrep_data.evaluate.world_model_results import save
 from navrep_data.testing import tiny_dataset
 
 
-def results(folder, name, outcome, suite="navrep27", variant=None, physics="original", inference="deterministic"):
+def results(folder, name, outcome, suite="navrep27", variant=None, physics="original", **how):
     """Write a results file with the given outcome per episode."""
-    spec = PilotSpec(name, "scan", variant or name.partition(".")[0], "zoo", inference=inference)
+    spec = PilotSpec(name, "scan", variant or name.partition(".")[0], "zoo", **how)
     found = Results(header_of(spec, get_suite(suite), physics))
     n = len(outcome)
     found.outcome, found.events, found.steps = list(outcome), ["goal"] * n, [10] * n
@@ -60,13 +61,14 @@ def test_whose_numbers():
 def test_runs_of_a_variant_are_one_bar_and_ours_is_never_among_them(measured):
     found = scores(find_benchmarks(measured, "navrep27"))
     two = found["e2e_1d"]["released"]["all"]
-    assert (two["value"], two["low"], two["high"], len(two["runs"])) == (0.5, 1 / 3, 2 / 3, 2)
+    rates = tuple(two[f"success_rate{end}"] for end in ("", "_low", "_high"))
+    assert (rates, len(two["runs"])) == ((0.5, 1 / 3, 2 / 3), 2)
     assert set(found["transformer_rings_z"]) == {"released", "ours"}
-    assert found["transformer_rings_z"]["ours"]["all"]["value"] == pytest.approx(21 / 27)
+    assert found["transformer_rings_z"]["ours"]["all"]["success_rate"] == pytest.approx(21 / 27)
     assert (
-        found["transformer_rings_z"]["released"]["all"]["low"]
+        found["transformer_rings_z"]["released"]["all"]["success_rate_low"]
         < 3 / 27
-        < found["transformer_rings_z"]["released"]["all"]["high"]
+        < found["transformer_rings_z"]["released"]["all"]["success_rate_high"]
     )
     assert set(found["e2e_1d"]["released"]) == set(PARTS)
 
@@ -128,6 +130,40 @@ def test_table_has_a_column_per_source_and_the_goal_beside(measured):
     assert "| transformer_rings_z | - | - | 40.0 % (" in text
     assert "| 20.0 % | 30.0 % |" in text
     assert "76 %" in text
+
+
+AS_FED = {"ranges": "as_released", "scaling": "none"}
+WORDS = "ranges as the authors fed them"
+
+
+def test_the_table_names_runs_fed_as_the_authors_do_it(measured):
+    assert WORDS not in reproduce("table", measured).text
+    results(measured, "e2e_1d.20201026", "S" * 27, variant=f"e2e_1d ({WORDS})", **AS_FED)
+    done = reproduce("table", measured)
+    head, _, *lines = [line.split("|")[1:-1] for line in done.text.splitlines() if line.startswith("|")]
+    assert head[2].strip() == f"released weights, {WORDS}, measured by us: contact-free"
+    row = next(line for line in lines if line[0].strip() == "e2e_1d")
+    assert [row[k].strip().partition(" (")[0] for k in (3, 5)] == ["100.0 %", "50.0 %"]
+    assert "ranges uncut and nothing scaled" in done.text
+    assert {s["source"] for s in done.sources if s["name"] == "e2e_1d"} == {"released_as_fed", "released", "authors"}
+
+
+def test_figures_name_runs_fed_as_the_authors_do_it_and_draw_each_policy_once(measured, maps, monkeypatch):
+    from navrep_data.evaluate.reproduce import testing
+
+    drawn = []
+    monkeypatch.setattr(testing, "comparison", lambda chosen, labels: drawn.extend(r.name for r in chosen))
+    results(measured, "e2e_1d.20201026", "S" * 27, variant=f"e2e_1d ({WORDS})", **AS_FED)
+    results(measured, "soadrl.20200101", "S" * 27, variant=f"soadrl ({WORDS})", **AS_FED)
+    testing.trajectories(measured)
+    assert sum(name.startswith("e2e_1d.20201026") for name in drawn) == 1
+    assert "e2e_1d.20201026" in drawn
+    assert f"soadrl.20200101 ({WORDS})" in drawn, "the only results of a policy are shown, and say how it was fed"
+    figure = testing.testing(measured).figure
+    said = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert f"released weights, {WORDS}, measured by us" in said
+    assert "released weights, measured by us" in said
+    assert "ranges uncut and nothing scaled" in figure.get_supxlabel()
 
 
 @pytest.mark.slow
@@ -217,9 +253,11 @@ def test_the_table_is_what_its_suffix_says(measured):
     assert "|" not in tex.split("end{tabular}")[0]
     with open(measured / "t.csv", newline="") as file:
         rows = {(r["name"], r["source"]): r for r in csv.DictReader(file) if r["suite"] == "navrep27"}
-    assert float(rows["transformer_rings_z", "authors"]["value"]) == pytest.approx(0.391, abs=5e-4)
-    assert float(rows["e2e_1d", "released"]["value"]) == 0.5
-    assert rows["e2e_1d", "released"]["runs"].split() == ["e2e_1d.20201026", "e2e_1d.20201027"]
+    assert float(rows["transformer_rings_z", "authors"]["success_rate"]) == pytest.approx(0.391, abs=5e-4)
+    ends = ("", "_low", "_high")
+    shares = [float(rows["e2e_1d", "released"][f"{name}_rate{end}"]) for name in SUCCESSES for end in ends]
+    assert shares == pytest.approx([1 / 3, 6 / 27, 12 / 27, 0.5, 1 / 3, 2 / 3])
+    assert rows["e2e_1d", "released"]["runs"].split("; ") == ["e2e_1d.20201026", "e2e_1d.20201027"]
 
 
 def test_figures_are_drawn_for_papers_too(tmp_path):

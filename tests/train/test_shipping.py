@@ -25,11 +25,13 @@ from navrep_data.models import checkpoint
 from navrep_data.shards import dataset_record
 from navrep_data.train import controllers, default_controller_recipe, default_recipe, shipping, train_world_model
 from navrep_data.train.half import rounding
-from navrep_data.zoo import cards, names, own_cards, registry
+from navrep_data.zoo import cards, golden, names, own_cards, registry
 from navrep_data.zoo.local import load_any_model
 
 VARIANT = "transformer_1d"
 COMMANDS = ["navrep-data generate --env soadrl --n 4 --out data", "navrep-data train transformer --lidar 1d ..."]
+
+CONTROLLER = "navrep-data train controller --model models/w ..."
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +64,7 @@ def package(tmp_path, monkeypatch):
     caches = (registry.records, registry.variants, registry.full_names)
     monkeypatch.setattr(registry, "FOLDER", root)
     monkeypatch.setattr(names, "UNTAGGED_ARE_OURS", names.UNTAGGED_ARE_OURS | {VARIANT, f"{VARIANT}_z"})
+    monkeypatch.setattr(golden, "COMPACT", tmp_path / "goldens")  # the package's are of the weights that it ships
     monkeypatch.setenv("NAVREP_DATA_OFFLINE", "1")
     monkeypatch.setenv("NAVREP_DATA_HOME", str(tmp_path / "home"))
     for cached in caches:
@@ -74,7 +77,7 @@ def package(tmp_path, monkeypatch):
 def ship(trained, package, dataset):
     recipes = package.parent / "recipes"
     w = shipping.ship(trained / "w", VARIANT, dataset, commands=COMMANDS, root=package, recipes=recipes)
-    c = shipping.ship(trained / "c", f"{VARIANT}_z", dataset, commands=["c"], root=package, recipes=recipes)
+    c = shipping.ship(trained / "c", f"{VARIANT}_z", dataset, commands=[CONTROLLER], root=package, recipes=recipes)
     return w, c
 
 

@@ -12,9 +12,12 @@ from navrep_data.evaluate.sources import SOURCES
 from navrep_data.io import read_json
 from navrep_data.zoo import registry
 
-COLOURS = {"authors": "#9a9a9a", "released": "#0072B2", "ours": "#E69F00", "baseline": "#009E73", "other": "#CC79A7"}
+COLOURS = {
+    "authors": "#9a9a9a", "released": "#0072B2", "released_as_fed": "#56B4E9", "ours": "#E69F00", "baseline": "#009E73",
+    "other": "#CC79A7",
+}  # fmt: skip
 """One colour per source, the same in all figures (Okabe and Ito's, which colour-blind readers can tell apart)."""
-HATCHES = {"authors": "////", "released": "", "ours": "", "baseline": "", "other": ""}
+HATCHES = {source: "////" if source == "authors" else "" for source in COLOURS}
 _MAX_BYTES = 1 << 20
 
 

@@ -9,18 +9,18 @@ from typing import Any
 from navrep_data.evaluate.figures import MAX_ROWS, comparison, new_figure
 from navrep_data.evaluate.reproduce.drawn import COLOURS, HATCHES, Drawn, Missing, authors, label, shipped
 from navrep_data.evaluate.results import NOT_PLAYED, Results
-from navrep_data.evaluate.sources import find_benchmarks, source_of
+from navrep_data.evaluate.scores import SUCCESSES
+from navrep_data.evaluate.sources import find_benchmarks, source_of, source_of_results
 from navrep_data.evaluate.statistics import spread, wilson
-from navrep_data.schema import fed_as
+from navrep_data.schema import fed_as, noise_of
 from navrep_data.sim.scenarios import MAP_GROUPS
 
 PARTS = ("all", *MAP_GROUPS)
-_MEASURED = ("released", "ours", "other", "baseline")
-_WIDTH = 0.27
-_AUTHORS_WAY = fed_as({"ranges": "as_released"})
+_MEASURED = ("released_as_fed", "released", "ours", "other", "baseline")
+_WIDTH = 0.22  # four of them stand side by side: the authors', released as fed, released, ours
 _PALE = 0.35
 """Opacity of the success as released, behind that without contact."""
-_FREE = ("contact_free", "contact_free_low", "contact_free_high")
+_FREE, _SUCCESS = (tuple(f"{name}_rate{end}" for end in ("", "_low", "_high")) for name in SUCCESSES)
 Score = dict[str, Any]
 
 
@@ -28,22 +28,21 @@ def scores(found: Sequence[Results]) -> dict[str, dict[str, dict[str, Score]]]:
     """Return both successes by variant, source and part (all, maps).
 
     Several runs of a variant are one score, from the least to the greatest of them; a single one has Wilson's interval.
-    Beside the authors' numbers stand runs of their networks that were fed as their software does it, where there are.
-    `value`, `low` and `high` are of the success as released, which is what the authors' numbers are of;
-    `contact_free`, `contact_free_low` and `contact_free_high` of that without contact.
+    Released networks that were fed as the authors' software does it are a source of their own, ``released_as_fed``;
+    runs with noise, and of networks that were not scaled otherwise, are left out. ``success_rate``, with ``_low`` and
+    ``_high``, is the success as released, which is what the authors' numbers are of; ``contact_free_rate`` that without
+    contact.
     """
-    fed: dict[tuple[str, str], dict[str, list[Results]]] = {}
+    runs: dict[tuple[str, str], list[Results]] = {}
     for results in found:
-        settings = results.header["settings"]
-        if settings["inference"] == "deterministic":
-            source, name = source_of(results.header["name"]), results.header["variant"]
-            name = results.header["name"].partition(".")[0] if source == "ours" else name.partition(" (")[0]
-            fed.setdefault((name, source), {}).setdefault(fed_as(settings), []).append(results)
-    runs = {key: of.get(_AUTHORS_WAY) or of.get("") for key, of in fed.items()}
+        settings, source = results.header["settings"], source_of_results(results)
+        if noise_of(settings) or (fed_as(settings) and source != "released_as_fed"):
+            continue
+        name = results.header["variant"].partition(" (")[0]
+        name = results.header["name"].partition(".")[0] if source == "ours" else name
+        runs.setdefault((name, source), []).append(results)
     merged: dict[str, dict[str, dict[str, Score]]] = {}
     for (variant, source), of in runs.items():
-        if of is None:  # only as trained
-            continue
         parts = ("all", *of[0].suite.maps)
         merged.setdefault(variant, {})[source] = {part: _merge(of, part) for part in parts}
     return merged
@@ -66,7 +65,7 @@ def _merge(runs: Sequence[Results], part: str) -> Score:
     names, episodes = [r.name for r in runs], sum(n for *_, n in counts)
     counts = [c for c in counts if c[-1]]
     found: Score = {}
-    for which, keys in enumerate((("value", "low", "high"), _FREE)):
+    for which, keys in enumerate((_SUCCESS, _FREE)):
         ends: Sequence[float | None] = (None, None, None)
         if counts:
             rates = [c[which] / c[-1] for c in counts]
@@ -117,7 +116,7 @@ def testing(folder: Path) -> Drawn:
     for ax, part in zip(axes, PARTS, strict=True):
         for i, variant in enumerate(order):
             _bars(ax, i, measured.get(variant, {}), authors()[part].get(variant), part)
-        for key, style in (("contact_free", "--"), ("value", "-.")):
+        for key, style in (("contact_free_rate", "--"), ("success_rate", "-.")):
             level = goal.get(part, {}).get(key)
             if level is not None:
                 ax.axhline(100 * level, color="black", linestyle=style, linewidth=0.8, zorder=1)
@@ -136,18 +135,18 @@ def testing(folder: Path) -> Drawn:
     axes[-1].set_xticks(range(len(order)), order, rotation=40, ha="right", rotation_mode="anchor", fontsize=8)
     kinds = [s for s in _MEASURED if any(s in of for of in measured.values())]
     _legend(figure, kinds, bool(goal))
-    figure.supxlabel(_note(found), fontsize=7)
+    figure.supxlabel(_note(found, "released_as_fed" in kinds), fontsize=7)
     return Drawn(figure, sources=_sources(measured, goal), missing=lacks)
 
 
 def _bars(ax: Any, i: int, measured: dict[str, dict[str, Score]], theirs: float | None, part: str) -> None:
     """Draw one variant's bars side by side, the authors' first."""
-    entries: list[tuple[str, Score]] = [] if theirs is None else [("authors", {"value": theirs})]
+    entries: list[tuple[str, Score]] = [] if theirs is None else [("authors", {"success_rate": theirs})]
     entries += [(s, measured[s][part]) for s in _MEASURED if s in measured and part in measured[s]]
-    entries = [(source, score) for source, score in entries if score["value"] is not None]
+    entries = [(source, score) for source, score in entries if score["success_rate"] is not None]
     for j, (source, score) in enumerate(entries):
         x = i + (j - (len(entries) - 1) / 2) * _WIDTH
-        value = 100 * score["value"]
+        value = 100 * score["success_rate"]
         style: dict[str, Any] = {"color": COLOURS[source], "alpha": _PALE}
         if source == "authors":  # an outline: it is not ours to vouch for
             style = {"facecolor": "white", "edgecolor": COLOURS[source], "hatch": HATCHES[source], "linewidth": 0.8}
@@ -181,7 +180,13 @@ def _legend(figure: Any, kinds: Sequence[str], goal: bool) -> None:
     figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8, frameon=False)
 
 
-def _note(found: Sequence[Results]) -> str:
+_AS_FED = (
+    f"{label('released_as_fed').capitalize()}: as their software runs them, ranges uncut and nothing scaled; "
+    f"{label('released')}: ranges cut at the 25 m of their training, in proportion to the robot."
+)
+
+
+def _note(found: Sequence[Results], as_fed: bool) -> str:
     played = sorted({sum(c != "-" for c in r.outcome) for r in found})
     each = f"{played[0]:,}" if len(played) == 1 else f"{played[0]:,} to {played[-1]:,}"
     seen = sorted({f"{r.name} sees {r.header['sees']}" for r in found if source_of(r.header["name"]) == "baseline"})
@@ -190,6 +195,7 @@ def _note(found: Sequence[Results]) -> str:
         f"Measured: {each} episodes per policy, original physics. Filled: success without contact, with intervals of "
         "95 % (Wilson) or least to greatest of several runs; pale: success as released.\nThe authors' bars are read "
         "off their figure (+-0.5): of other episodes, and to be held against success as released."
+        + (f"\n{_AS_FED}" if as_fed else "")
         + (f"\n{baselines.strip()}" if baselines else "")
     )
 
@@ -203,7 +209,7 @@ def _sources(measured: dict[str, dict[str, dict[str, Score]]], goal: dict[str, S
     ]
     rows += [{"name": "goal", "source": "baseline", "part": part, **score} for part, score in goal.items()]
     return rows + [
-        {"name": name, "source": "authors", "part": part, "value": value}
+        {"name": name, "source": "authors", "part": part, "success_rate": value}
         for part in PARTS
         for name, value in authors()[part].items()
     ]
@@ -218,18 +224,23 @@ def trajectories(folder: Path) -> Drawn:
     lacks = missing(folder, "navrep27", _names(found))
     if not found:
         return Drawn(missing=lacks)
-    scored = {r.name: _merge([r], "all") for r in found}
-    rate = {name: score["contact_free"] or 0.0 for name, score in scored.items()}
-    ranked = sorted(found, key=lambda r: -rate[r.name])
+    shown: dict[str, Results] = {}  # one of each policy: the one that was run and fed as by default, where there is one
+    for r in sorted(found, key=lambda r: r.name != r.header["name"]):
+        shown.setdefault(r.header["name"], r)
+    scored = {r.name: _merge([r], "all") for r in shown.values()}
+    rate = {name: score["contact_free_rate"] or 0.0 for name, score in scored.items()}
+    ranked = sorted(shown.values(), key=lambda r: -rate[r.name])
     most = {"ours": 3, "released": 3, "other": 1, "baseline": 1}
     chosen: list[Results] = []
     for source, n in most.items():
         chosen += [r for r in ranked if source_of(r.header["name"]) == source][:n]
     chosen = chosen[:MAX_ROWS]
-    labels = [f"{r.name}\n({label(source_of(r.header['name'])).split(',')[0]})" for r in chosen]
+    labels = [
+        f"{r.name}\n({label(source_of(r.header['name'])).split(',')[0]})" for r in chosen
+    ]  # the name says how fed
     sources = [
-        {"name": r.name, "source": source_of(r.header["name"]), "contact_free_rate": rate[r.name],
-         "success_rate": scored[r.name]["value"] or 0.0}
+        {"name": r.name, "source": source_of_results(r), "contact_free_rate": rate[r.name],
+         "success_rate": scored[r.name]["success_rate"] or 0.0}
         for r in chosen
     ]  # fmt: skip
     return Drawn(comparison(chosen, labels), sources=sources, missing=lacks)
@@ -238,7 +249,7 @@ def trajectories(folder: Path) -> Drawn:
 # --- table ---------------------------------------------------------------------------------------------------------
 
 
-_COLUMNS = {"released": ("released",), "ours": ("ours",), "other": ("baseline", "other")}
+_OTHERS = ("baseline", "other")
 _TITLES = {
     "navrep27": "The paper's 27 test scenarios",
     "navreptest": "navreptest: the training environment's 200 test episodes",
@@ -258,12 +269,14 @@ def table(folder: Path) -> Drawn:
             parts.append(f"## {_TITLES[suite]}\n\n{text}")
             sources += rows
     teb = authors()["teb"]
+    as_fed = any(row["source"] == "released_as_fed" for row in sources)
     parts.append(
         "Success: contact-free (the goal without touching anybody or anything), then as released (by the rules of the "
         "environment, which allow contacts in the 27 scenarios). "
         f"{label('authors').capitalize()}: {authors()['source']}; as released, of other episodes than ours. Measured: "
         "in original physics; one run with its 95 % interval, several with mean and least to greatest. TEB: "
         f"{100 * teb['success']:.0f} % in the 27 scenarios, as released ({teb['source']})."
+        + (f" {_AS_FED}" if as_fed else "")
     )
     return Drawn(text="\n\n".join(parts) + "\n", sources=sources, missing=lacks)
 
@@ -272,7 +285,11 @@ def _one_table(suite: str, measured: dict[str, dict[str, dict[str, Score]]]) -> 
     theirs = authors()["all"] if suite == "navrep27" else {}
     goal = _cells(measured.get("goal", {}).get("baseline", {}).get("all"), interval=False)
     head = ["policy", *([f"{label('authors')} (as released)"] if theirs else [])]
-    for what in (label("released"), label("ours"), "baselines and others, measured by us", "`goal`, same episodes"):
+    # networks that were fed as the authors do it have a column where there are any
+    as_fed = any("released_as_fed" in of for of in measured.values())
+    columns = [*([("released_as_fed",)] if as_fed else []), ("released",), ("ours",), _OTHERS]
+    titles = ["baselines and others, measured by us" if kinds == _OTHERS else label(kinds[0]) for kinds in columns]
+    for what in (*titles, "`goal`, same episodes"):
         head += [f"{what}: contact-free", "as released"]
     lines = [head, ["---"] * len(head)]
     sources: list[dict[str, Any]] = []
@@ -280,20 +297,20 @@ def _one_table(suite: str, measured: dict[str, dict[str, dict[str, Score]]]) -> 
         cells = [variant]
         if theirs:
             cells.append(f"{100 * theirs[variant]:.1f} %" if variant in theirs else "-")
-        for kinds in _COLUMNS.values():
+        for kinds in columns:
             of = next((measured[variant][k] for k in kinds if k in measured.get(variant, {})), None)
             cells += _cells(None if of is None else of["all"])
         sources += [{"name": variant, "suite": suite, "source": k, **of["all"]}
                     for k, of in measured.get(variant, {}).items()]  # fmt: skip
         if variant in theirs:
-            sources.append({"name": variant, "suite": suite, "source": "authors", "value": theirs[variant]})
+            sources.append({"name": variant, "suite": suite, "source": "authors", "success_rate": theirs[variant]})
         lines.append([*cells, *goal])
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines), sources
 
 
 def _cells(score: Score | None, interval: bool = True) -> list[str]:
     """Return the texts of the success without contact and of that as released."""
-    return [_cell(score, *keys, interval) for keys in (_FREE, ("value", "low", "high"))]
+    return [_cell(score, *keys, interval) for keys in (_FREE, _SUCCESS)]
 
 
 def _cell(score: Score | None, value: str, low: str, high: str, interval: bool) -> str:
