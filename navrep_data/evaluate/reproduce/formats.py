@@ -58,7 +58,7 @@ def _vector(drawn: Drawn, kind: str) -> bytes:
 
 
 def numbers(drawn: Drawn) -> str:
-    """Return the numbers of a table as CSV, a row per policy, suite and source; shares from 0 to 1, runs joined by "; "."""
+    """Return the numbers of a table as CSV, a row per policy, suite and source; shares of 1, `runs` joined by "; "."""
     fields = list(dict.fromkeys(key for row in drawn.sources for key in row))
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, fields, lineterminator="\n")
