@@ -310,10 +310,11 @@ def _one_table(suite: str, measured: dict[str, dict[str, dict[str, Score]]]) -> 
 
 def _cells(score: Score | None, interval: bool = True) -> list[str]:
     """Return the texts of the success without contact and of that as released."""
-    return [_cell(score, *keys, interval) for keys in (_FREE, _SUCCESS)]
+    return [_cell(score, keys, interval) for keys in (_FREE, _SUCCESS)]
 
 
-def _cell(score: Score | None, value: str, low: str, high: str, interval: bool) -> str:
+def _cell(score: Score | None, keys: tuple[str, ...], interval: bool) -> str:
+    value, low, high = keys
     if score is None or score[value] is None:
         return "-"
     text = f"{100 * score[value]:.1f} %"
