@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from navrep_data.cli.models import _score
 from navrep_data.evaluate import get_suite
 from navrep_data.evaluate.metrics import METRICS, Contacts
 from navrep_data.evaluate.policies import resolve_policy
@@ -74,6 +75,8 @@ def test_lists_show_the_main_result_alone(entries):
     assert measured.main_result([*entries[1:], main], "navreptest", "original")["command"] == COMMAND
     old = {"suite": "navreptest", "physics": "original", "success_rate": 0.5}
     assert measured.main_result([later, old], "navreptest", "original") == old
+    assert _score([later, {**main, "contact_free_rate": 0.25, "success_rate": 0.5}], "navreptest") == "25.0 (50.0) %"
+    assert _score([later], "navreptest") == "-"
 
 
 @pytest.mark.parametrize("name", [NAME, "e2e_1d.v1"])
