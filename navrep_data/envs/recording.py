@@ -17,6 +17,7 @@ from PIL import Image
 
 from navrep_data.envs.single import NavRepEnv
 from navrep_data.errors import ConfigError, MissingExtraError
+from navrep_data.sim import RobotPolicy, SimConfig, knows_robots
 
 Policy = Callable[[Any], ArrayLike]
 """Takes an observation, returns an action in [-1, 1]."""
@@ -85,7 +86,8 @@ def record(
         A NavRep environment, wrapped or not, of any render mode.
     policy : callable, or object with ``act(scan, robot_state)``
         ``policy(observation)`` returns an action in [-1, 1]; an object with ``act``, such as those of the zoo, is
-        reset with ``batch_size=1`` and gets batches of one.
+        reset with ``batch_size=1`` and gets batches of one. The zoo's are told the environment's robot and what it was
+        sent, see :class:`navrep_data.sim.RobotPolicy`.
     path : path
         ``.gif``, or ``.mp4`` where imageio-ffmpeg is installed.
     seed, options
@@ -119,7 +121,7 @@ def record(
     """
     target = Path(path)
     world = _checked(env, target, speed)
-    act = _as_callable(policy)
+    act = _as_callable(policy, world.config)
     observation, info = env.reset(seed=seed, options=options)
     frames, total, steps, over = [world.frame(size)], 0.0, 0, False
     while not over and (max_steps is None or steps < max_steps):
@@ -145,16 +147,20 @@ def _checked(env: gymnasium.Env[Any, Any], target: Path, speed: float) -> NavRep
     return world
 
 
-def _as_callable(policy: Any) -> Policy:
+def _as_callable(policy: Any, config: SimConfig) -> Policy:
     if not hasattr(policy, "act"):
         if not callable(policy):
             raise ConfigError(f"policy is {policy!r}, expected a function of the observation or an object with act().")
         return policy  # type: ignore[no-any-return]
+    choose = policy.act
+    if knows_robots(policy):
+        policy = RobotPolicy(policy, config)
+        choose = policy.shares
     if hasattr(policy, "reset"):
         policy.reset(batch_size=1)
 
     def act(observation: dict[str, Any]) -> NDArray[Any]:
-        actions = np.asarray(policy.act(observation["scan"][None], observation["robot_state"][None]))
+        actions = np.asarray(choose(observation["scan"][None], observation["robot_state"][None]))
         return actions[0, ...]
 
     return act

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from navrep_data.errors import PolicyError
 from navrep_data.evaluate.worlds import Worlds
 from navrep_data.schema import ACTION_SIZE
+from navrep_data.sim.driving import listens, policy_for
 
 F64 = NDArray[np.float64]
 BLOCK = 64
@@ -148,12 +149,14 @@ class ZooPilot(FunctionPilot):
 
     def _use(self, policy: Any) -> None:
         self._policy, self._function, self._reset = policy, policy.act, policy.reset
-        self._observe = None if policy.ranges == "as_released" else policy.observe
+        self._observe = policy.observe if listens(policy) else None
 
     def start(self, worlds: Worlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
         """Clear the memory of new episodes, and start the noise of a group."""
-        if self._scaling == "robot" and worlds.robot != self._policy.robot:
-            self._use(self._policy.for_robot(worlds.robot.max_speed, worlds.robot.radius))
+        if self._scaling == "robot":
+            fitting = policy_for(self._policy, worlds.robot)
+            if fitting is not self._policy:
+                self._use(fitting)
         if self.grouped:
             first = int(episodes[mask][0]) // BLOCK * BLOCK
             self._policy.reset(batch_size=BLOCK, seed=self._first_seed + first)

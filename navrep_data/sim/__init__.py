@@ -2,6 +2,7 @@
 
 from navrep_data.sim.actions import robot_contract, scale_actions, velocity_commands
 from navrep_data.sim.config import SimConfig
+from navrep_data.sim.driving import RobotPolicy, knows_robots
 from navrep_data.sim.gridmap import GridMap
 from navrep_data.sim.map_rollout import CallableMapRollout, ScriptedMapRollout
 from navrep_data.sim.maps import load_map, map_names
@@ -31,6 +32,7 @@ __all__ = [
     "CallableRollout",
     "GridMap",
     "PolicyFunction",
+    "RobotPolicy",
     "RolloutSettings",
     "Scenario",
     "ScriptedMapRollout",
@@ -47,6 +49,7 @@ __all__ = [
     "environment_names",
     "get_scenario",
     "gymnasium_id",
+    "knows_robots",
     "load_map",
     "make_config",
     "map_names",

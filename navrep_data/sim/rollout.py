@@ -16,6 +16,7 @@ from navrep_data.sim import _layout as lay
 from navrep_data.sim._batch import reset_worlds, seed_worlds
 from navrep_data.sim._rollout import begin_rows, finish_rows, rollout_sequence
 from navrep_data.sim.config import SimConfig
+from navrep_data.sim.driving import RobotPolicy, knows_robots
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
 from navrep_data.sim.simulator import WorldArrays, check_seed, no_world
 
@@ -182,7 +183,8 @@ class CallableRollout:
     policy : callable
         ``policy(scan, robot_state) -> action``: (B, 1080) [m] and (B, 5) in, (B, 2) or (B, 3) [m/s, m/s, rad/s] out. If
         it has a method ``reset``, that is called as ``reset(batch_size=B)`` at the start of a group and
-        ``reset(mask=...)`` where new episodes begin.
+        ``reset(mask=...)`` where new episodes begin. A policy of the zoo drives as it is, see
+        :class:`navrep_data.sim.RobotPolicy`.
     batch : int
         Sequences per group. The policy always sees exactly this many rows (the last group is filled up with copies of
         its first world), so that a network's numbers never depend on how many sequences there are.
@@ -198,7 +200,7 @@ class CallableRollout:
             )
         self.config = config
         self.settings = settings
-        self.policy = policy
+        self.policy = RobotPolicy(policy, config) if knows_robots(policy) else policy
         self.seed = check_seed(seed)
         self.batch = batch
         self._arrays: WorldArrays | None = None

@@ -1,13 +1,16 @@
 """A policy keeps its contract: ranges are cut as in training, another robot is seen in the proportions of its own."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from navrep_data import zoo
-from navrep_data.errors import CheckpointError, ConfigError
+from navrep_data.errors import CheckpointError, ConfigError, PolicyError
+from navrep_data.generate import generate
 from navrep_data.models import (
     Controller,
     ControllerConfig,
@@ -18,7 +21,8 @@ from navrep_data.models import (
 )
 from navrep_data.observations import RobotScale
 from navrep_data.schema import RobotContract, SensorContract
-from navrep_data.sim import make_config, robot_contract
+from navrep_data.shards import DatasetFolder
+from navrep_data.sim import make_config, robot_contract, scale_actions
 from navrep_data.zoo.policy import Policy
 
 
@@ -150,3 +154,31 @@ def test_robots_of_environments():
 @pytest.mark.parametrize("name", ["e2e_1d.v1", "e2e_1d.20201026"])
 def test_records_say_what_robot_a_policy_was_trained_on(name):
     assert RobotContract(**zoo.show(name).robot) == RobotContract()
+
+
+def test_what_generate_says_of_networks_is_so(tmp_path, monkeypatch):
+    """The file that the refusal tells one to write drives the robot of the environment at its speed."""
+    monkeypatch.chdir(tmp_path)
+    policy = remembering()
+    torch.nn.init.normal_(policy.network.mean.weight, std=3.0)
+    zoo.save_policy(policy, tmp_path / "mine")
+    with pytest.raises(PolicyError, match="is named drive:policy") as refused:
+        generate(n=1, out=tmp_path / "d", policy="./mine")
+    (tmp_path / "drive.py").write_text(re.search("`(.*)`", str(refused.value))[1])
+    folder = tmp_path / "hall"
+    folder.mkdir()
+    Image.new("L", (100, 100), 254).save(folder / "m.png")
+    (folder / "m.yaml").write_text(
+        "image: m.png\nresolution: 0.2\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    )
+    settings = {"humans": 0, "length": 8, "scan_dtype": "float32", "policy": "drive:policy", "policy_batch": 1}
+    generate("map", n=1, out=tmp_path / "d", workers=1, maps=[str(folder)], **settings)
+    with DatasetFolder(tmp_path / "d") as made:
+        scan, state, action = (made.read(name, 0, 0, 8) for name in ("scan", "robot_state", "action"))
+    slow, config = policy.for_robot(0.55, 0.3), make_config("map", maps=(str(folder),), humans=0)
+    slow.reset(batch_size=1)
+    for k in range(7):
+        share = slow.act(scan[k : k + 1], state[k : k + 1])[0]
+        assert np.abs(share).max() > 0.5
+        np.testing.assert_allclose(action[k], scale_actions(config, share), rtol=1e-4, atol=1e-5)
+        slow.observe(action[k : k + 1])
