@@ -74,8 +74,8 @@ def numpy_seed(env: str, episode: int) -> int:
     Notes
     -----
     The original places obstacles without asking whether a way to the goal is left. Of its worlds of ``navrep-val`` with
-    numpy seeds 0 to 199, that of 167 has none by small steps, neither between the cells that the robot collides with nor
-    between the obstacles that the lidar and ORCA see, which are larger by a quarter; those of 15 and 198 have none
+    numpy seeds 0 to 199, that of 167 has none by small steps, neither between the cells that the robot collides with
+    nor between the obstacles that the lidar and ORCA see, which are larger by a quarter; those of 15 and 198 have none
     between the obstacles that are seen, but one between the cells.
     """
     env = environment_name(env)
