@@ -45,7 +45,7 @@ class SimConfig:
     env : str
         Name in the registry that this config came from.
     physics : str
-        ``"consistent"``: one geometry for lidar, ORCA and collisions, rewards as in the paper.
+        ``"consistent"``: one geometry of obstacles for lidar, ORCA and collisions, rewards as in the paper.
         ``"original"``: what the released software does, see docs/differences.md.
     crossing : str
         ``"circle"`` (training): humans cross a circle; ``"square"`` (test): a square.
