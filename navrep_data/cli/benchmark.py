@@ -10,6 +10,10 @@ import typer
 from navrep_data.cli._common import print_json, say, say_err, show_progress
 from navrep_data.errors import ConfigError
 
+_PAIRS_SHOWN = 6
+"""More pairs of policies than these are left to report.md: four policies have six, ten have 45."""
+_MANY_PAIRS = "Paired tests of {} pairs of policies: in report.md."
+
 
 def benchmark_command(
     names: Annotated[
@@ -125,7 +129,7 @@ def _short(report: Any) -> str:
         tables.overall(report.rows, report.baseline),
         tables.variants(report.variants, report.rows, report.baseline),
         tables.per_part(report.rows, report.baseline, "per_map"),
-        tables.paired(report.pairs),
+        tables.paired(report.pairs) if len(report.pairs) <= _PAIRS_SHOWN else _MANY_PAIRS.format(len(report.pairs)),
     ]
     return "\n\n".join(part for part in parts if part)
 
