@@ -21,7 +21,7 @@ HOW = {"ranges": RANGES[0], "scaling": SCALING[0], "inference": INFERENCE[0]}
 BY_CONTRACT = "contract, scaled"
 """How networks are fed by default, in words."""
 _FROM_THE_FIRST = "from 0"
-_BEFORE_FEEDING = "uncut, as trained"
+_BEFORE_FEEDING = "uncut, as trained, by an earlier version"
 
 
 def is_benchmark(entry: Entry) -> bool:
