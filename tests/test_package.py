@@ -25,6 +25,8 @@ def test_every_error_is_ours_and_a_builtin():
     classes = [c for _, c in inspect.getmembers(errors, inspect.isclass) if c.__module__ == errors.__name__]
     assert len(classes) > 10
     for c in classes:
+        if issubclass(c, Warning):  # nothing is raised by these
+            continue
         assert issubclass(c, errors.NavrepDataError)
         if c is not errors.NavrepDataError:
             assert any(b.__name__ in dir(builtins) and b is not Exception for b in c.__mro__[1:-3]), c

@@ -69,8 +69,8 @@ def test_results_are_shown_with_command_and_baseline(monkeypatch):
     monkeypatch.setattr(cards, "variants", lambda: {"e2e_1d": measured})
     text = cards.card("e2e_1d")
     assert (
-        "| `e2e_1d.20201026` | navreptest | original | 200 (from 0) | uncut, as trained, by an earlier version | - | 62.5% | - / 15.0% | "
-        "`navrep-data benchmark zoo:e2e_1d.20201026 --suite navreptest` |"
+        "| `e2e_1d.20201026` | navreptest | original | 200 (from 0) | uncut, as trained, by an earlier version | - | "
+        "62.5% | - / 15.0% | `navrep-data benchmark zoo:e2e_1d.20201026 --suite navreptest` |"
     ) in text
     one = next(r for r in measured if r.tag == "20201026")
     words = "\n".join(cards.describe(one))
