@@ -7,6 +7,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 
 from site_pages import adapt_page
+from sphinx.pycode import ModuleAnalyzer
 
 from navrep_data import __version__
 
@@ -55,7 +56,6 @@ add_module_names = False
 # Roles that name a function, method, module or exception must find it. Types are prose ("ndarray of shape (N, 3)").
 nitpicky = True
 nitpick_ignore_regex = [("py:(class|obj)", ".*")]
-DOCUMENTED = {"SCAN_SCALE", "UINT16_RANGE_LIMIT"}  # by a docstring of their own
 LONGEST_VALUE = 250  # characters; longer ones tell nobody anything
 
 
@@ -68,11 +68,12 @@ def _adapt(app, docname, source):
 def _constants(name):
     """Return what shows a module's constants with their values, where those are short: autodoc leaves them out."""
     module = importlib.import_module(name)
+    documented = {attribute for _, attribute in ModuleAnalyzer.for_module(name).find_attr_docs()}  # autodoc shows these
     found = [
         constant
         for constant in getattr(module, "__all__", vars(module))
         if constant.isupper()
-        and constant not in DOCUMENTED
+        and constant not in documented
         and not callable(value := getattr(module, constant))
         and len(repr(value)) < LONGEST_VALUE
     ]

@@ -44,7 +44,7 @@ class Benchmark:
     baseline : dict
         The row of `goal`, asked for or not.
     pairs : list of dict
-        Any two policies on the same episodes; see :func:`navrep_data.evaluate.scores.compare`.
+        Any two policies on the same episodes; see ``navrep_data.evaluate.scores.compare``.
     text : str
         The report as Markdown.
     files : list of Path

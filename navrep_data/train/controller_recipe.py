@@ -57,7 +57,7 @@ class ControllerRecipe:
     physics : str
         Of the training worlds.
     sim : dict
-        Other settings of the training worlds, as :func:`navrep_data.train.settings.sim_settings` names them. Without
+        Other settings of the training worlds, as ``navrep_data.train.settings.sim_settings`` names them. Without
         any in ``navrep-train``, validation plays navrep-test in original physics, as the benchmark; otherwise the
         environment itself, with a constant curriculum.
     reward_scale : float

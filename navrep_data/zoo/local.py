@@ -25,7 +25,7 @@ def load_any_model(name: str | os.PathLike[str], source: str | os.PathLike[str] 
     ----------
     name : str or path-like
         Name such as ``transformer_1d.released``, or a place (``./folder``, ``hf://user/name``, see
-        :func:`navrep_data.zoo.folders.place_of`) with ``model.safetensors`` and ``config.json``: a checkpoint of
+        ``navrep_data.zoo.folders.place_of``) with ``model.safetensors`` and ``config.json``: a checkpoint of
         :mod:`navrep_data.models.checkpoint`, what ``navrep-data train`` wrote, or a policy of
         :func:`navrep_data.zoo.save_policy`.
     source : path-like or str, optional

@@ -193,10 +193,10 @@ class Policy:
         Parameters
         ----------
         max_speed : float, optional
-            Velocity along x and y that an action of 1 stands for on that robot [m/s]; that of :attr:`robot` if left
+            Velocity along x and y that an action of 1 stands for on that robot [m/s]; that of ``robot`` if left
             out, which is as trained until it has been set once.
         radius : float, optional
-            Radius of its footprint [m]; that of :attr:`robot` if left out.
+            Radius of its footprint [m]; that of ``robot`` if left out.
 
         Returns
         -------
