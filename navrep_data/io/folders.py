@@ -114,7 +114,8 @@ def _remove(path: Path) -> None:
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     else:
-        path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # there is nothing, or what it lies under is no folder
+            path.unlink()
 
 
 @contextlib.contextmanager

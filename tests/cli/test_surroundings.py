@@ -185,6 +185,14 @@ def test_a_reader_that_has_gone_is_no_error(dataset):
 # ---- Ctrl-C ----
 
 
+@pytest.fixture
+def heard():
+    """Ctrl-C reaches this process and those that it starts, also where the tests run in the background (nohup)."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def verbs(command=None, words=()):
     command = typer.main.get_command(cli.app) if command is None else command
     below = getattr(command, "commands", None)
@@ -219,7 +227,7 @@ def test_every_verb_says_once_that_it_was_interrupted(words, monkeypatch, capsys
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no process groups to signal")
 @pytest.mark.parametrize("workers", [1, 2])
-def test_ctrl_c_reaches_all_processes_and_is_told_once(workers, tmp_path):
+def test_ctrl_c_reaches_all_processes_and_is_told_once(workers, tmp_path, heard):
     """A terminal signals the whole group; workers still import, and would print tracebacks."""
     process = subprocess.Popen(
         [sys.executable, "-m", "navrep_data", "generate", "--n", "400", "--workers", str(workers), "--out", "d"],
@@ -235,7 +243,7 @@ def test_ctrl_c_reaches_all_processes_and_is_told_once(workers, tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals cannot be blocked here")
-def test_processes_start_deaf_to_ctrl_c_and_none_is_lost():
+def test_processes_start_deaf_to_ctrl_c_and_none_is_lost(heard):
     program = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))"
     with io.without_interrupts():
         found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
