@@ -15,7 +15,7 @@ def _place(name: str, text: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise ConfigError(f"--{name} is {text[:40]!r}, expected numbers with commas between them: 1.5,-2") from None
+        raise ConfigError(f"--{name} is {text!r}, expected numbers with commas between them: 1.5,-2") from None
 
 
 def play_command(

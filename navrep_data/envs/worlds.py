@@ -274,9 +274,7 @@ def _places(name: str, value: Any, n: int, sizes: tuple[int, ...]) -> F64:
         out[:, : rows.shape[-1]] = rows
         return out
     wanted = "x, y [m], or with a heading [rad]" if len(sizes) > 1 else "x, y [m]"
-    raise ConfigError(
-        f"{name} is {str(value)[:60]}, expected finite {wanted}, for all worlds or a row for each of {n}."
-    )
+    raise ConfigError(f"{name} is {value}, expected finite {wanted}, for all worlds or a row for each of {n}.")
 
 
 def _whole(name: str, value: Any, most: int) -> int:

@@ -173,7 +173,7 @@ def parse(pairs: Iterable[str], known: Mapping[str, Any], stage: str) -> dict[st
         name, equals, text = pair.partition("=")
         if not equals or name not in known:
             raise ConfigError(
-                f"--set {pair[:60]!r} is no setting.{hint(name, known)} Expected NAME=VALUE; list all: navrep-data "
+                f"--set {pair!r} is no setting.{hint(name, known)} Expected NAME=VALUE; list all: navrep-data "
                 f"train {stage} --list-settings"
             )
         try:
@@ -181,7 +181,7 @@ def parse(pairs: Iterable[str], known: Mapping[str, Any], stage: str) -> dict[st
         except (KeyError, ValueError):
             kind = {tuple: "list with commas", type(None): "number or none"}.get(type(known[name]))
             raise ConfigError(
-                f"--set {name}={text[:40]} is no {kind or type(known[name]).__name__}, as {name} is."
+                f"--set {name}={text} is no {kind or type(known[name]).__name__}, as {name} is."
             ) from None
     return found
 

@@ -179,7 +179,7 @@ def controller_worlds(policy: Policy, env: Any, n_envs: int) -> VecEnv:
     if isinstance(seen, spaces.Dict) and set(seen.spaces) == {"scan", "robot_state"} and acts.shape == (ACTION_SIZE,):
         return ControllerWorlds(env, policy)
     raise ConfigError(
-        f"{policy.name or 'This policy'} cannot be trained in an environment with observations {str(seen)[:80]} and "
+        f"{policy.name or 'This policy'} cannot be trained in an environment with observations {seen} and "
         f"actions {acts.shape}: expected Dict(scan, robot_state) and (3,), as make_sb3_vec('navrep-train') has, or "
         f"({policy.n_inputs},) and ({N_ACTIONS},)."
     )
