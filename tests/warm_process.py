@@ -79,16 +79,16 @@ def _become(request):
         os.dup2(os.open(Path(request["folder"], name), os.O_WRONLY | os.O_CREAT), number)
     # these hold what belonged to the process copied from
     sys.stdin, sys.stdout, sys.stderr = (open(k, "w" if k else "r") for k in range(3))  # noqa: SIM115
-    first, *rest = request["arguments"]
+    arguments = request["arguments"]
     try:
-        if first == "-c":
+        if arguments[:1] == ["-c"]:
             sys.argv[:] = ["-c"]
             sys.path[0] = ""
             warnings.simplefilter("error")
             sys.modules["__main__"] = main = types.ModuleType("__main__")
-            exec(compile(rest[0], "<string>", "exec"), vars(main))  # noqa: S102
+            exec(compile(arguments[1], "<string>", "exec"), vars(main))  # noqa: S102
         else:
-            sys.argv[:] = ["navrep-data", first, *rest]
+            sys.argv[:] = ["navrep-data", *arguments]
             runpy.run_module("navrep_data", run_name="__main__", alter_sys=True)
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)

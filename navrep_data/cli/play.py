@@ -35,9 +35,9 @@ def play_command(
     ] = None,
     episodes: Annotated[int | None, typer.Option("--n", help="End after so many episodes.")] = None,
     start: Annotated[
-        str | None, typer.Option("--start", metavar="X,Y[,THETA]", help="Where the robot starts [m, rad].")
+        str | None, typer.Option("--start", metavar="X,Y[,THETA]", help="Where the robot starts \\[m, rad].")
     ] = None,
-    goal: Annotated[str | None, typer.Option("--goal", metavar="X,Y", help="Where it wants to go [m].")] = None,
+    goal: Annotated[str | None, typer.Option("--goal", metavar="X,Y", help="Where it wants to go \\[m].")] = None,
     speed: Annotated[float, typer.Option("--speed", help="1 = real time.")] = 1.0,
 ) -> None:
     """Drive the robot by keyboard, where there is a window.

@@ -6,10 +6,13 @@ Rings hold 0, 1/2 and 1, which 8 bits represent exactly, so only weights and the
 scale per output channel for weights, one per map, from observations that it is calibrated on. Ranges would be cut to
 steps of 10 cm, so the first layer of the 1D encoder, a fortieth of its work, stays in float32. Features move by a
 hundredth of their spread; with bfloat16 by a few thousandths. benchmarks/training.py measures the speed, on an AMD
-EPYC without matrix units 1.8 (rings) and 1.4 (1D) times that of bfloat16.
+EPYC without matrix units 1.8 (rings) and 1.4 (1D) times that of bfloat16. Processors without instructions for 8-bit
+dot products get weights in 7 bits (:func:`weight_levels`), and features that move by a half more.
 """
 
 from __future__ import annotations
+
+from functools import cache
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +26,9 @@ _LEVELS = 255
 # even, so that 0, 1/2 and 1 are exact
 _RINGS_LEVELS = 254
 _WEIGHT_LEVELS = 127
+# Processors without instructions for 8-bit dot products add pairs of products in 16 bits and cut what is larger;
+# 2 x 255 x 64 still fits.
+_NARROW_WEIGHT_LEVELS = 64
 # A map's scale ignores the largest ones of this share: single outliers would cost all others resolution.
 _KEPT = 0.9999
 _AT_MOST = 1_000_000
@@ -31,22 +37,37 @@ _AT_MOST = 1_000_000
 def can_quantize() -> bool:
     """Tell whether this torch and processor multiply in 8 bits; the calls are not in torch's public interface."""
     try:
-        probe = nn.Conv2d(1, 32, 4, stride=2)
-        layer = _Layer(probe, 1 / _LEVELS, None)
-        found = layer(torch.full((2, 1, 8, 8), 100, dtype=torch.uint8).to(memory_format=torch.channels_last))
-        exact = probe(torch.full((2, 1, 8, 8), 100 / _LEVELS, dtype=torch.float32)).relu()
+        return _is_exact(_NARROW_WEIGHT_LEVELS)
     except (AttributeError, RuntimeError, TypeError):
         return False
-    return torch.allclose(found, exact, atol=0.02)
 
 
-class _Layer:
+@cache
+def weight_levels() -> int:
+    """Return into how many steps this processor lets weights be rounded without cutting any sum."""
+    return _WEIGHT_LEVELS if _is_exact(_WEIGHT_LEVELS) else _NARROW_WEIGHT_LEVELS
+
+
+def _is_exact(weight_levels: int) -> bool:
+    """Tell whether the largest possible sums come out right; both kinds of layer, since they take different paths."""
+    right = True
+    for channels in (1, 32):
+        probe = nn.Conv2d(channels, 32, 4, stride=2, bias=False)
+        nn.init.ones_(probe.weight)
+        layer = Layer(probe, 1 / _LEVELS, None, weight_levels)
+        largest = torch.full((2, channels, 8, 8), _LEVELS, dtype=torch.uint8)
+        found = layer(largest.to(memory_format=torch.channels_last))
+        right = right and torch.allclose(found, torch.full_like(found, channels * 16.0))
+    return right
+
+
+class Layer:
     """A convolution and ReLU from bytes to bytes, or to floats where `out_scale` is None."""
 
-    def __init__(self, conv: nn.Conv2d, in_scale: float, out_scale: float | None) -> None:
+    def __init__(self, conv: nn.Conv2d, in_scale: float, out_scale: float | None, weight_levels: int) -> None:
         weight = conv.weight.detach()
-        self.scales = weight.abs().amax((1, 2, 3)).clamp_min(1e-12) / _WEIGHT_LEVELS
-        rounded = (weight / self.scales[:, None, None, None]).round().clamp(-_WEIGHT_LEVELS, _WEIGHT_LEVELS)
+        self.scales = weight.abs().amax((1, 2, 3)).clamp_min(1e-12) / weight_levels
+        rounded = (weight / self.scales[:, None, None, None]).round().clamp(-weight_levels, weight_levels)
         self.stride = list(conv.stride)
         self.in_scale, self.out_scale = in_scale, out_scale
         self.bias = None if conv.bias is None else conv.bias.detach().clone()
@@ -56,6 +77,7 @@ class _Layer:
         )
 
     def __call__(self, x: Tensor) -> Tensor:
+        """Return the maps (N, channels, height, width) of bytes or floats, in channels-last order."""
         last = self.out_scale is None
         return torch.ops.onednn.qconv2d_pointwise(  # type: ignore[no-any-return]
             x, self.in_scale, 0, self.weight, self.scales, self.zeros, self.bias, self.stride, [0, 0], [1, 1], 1,
@@ -102,7 +124,7 @@ class QuantizedEncoder(nn.Module):
                 "precision to bfloat16."
             )
         self.lidar = vae.config.lidar
-        self.layers: list[_Layer | _FloatLayer] = []
+        self.layers: list[Layer | _FloatLayer] = []
         x = as_images(calibration.float(), self.lidar)
         scale = 1.0 / _RINGS_LEVELS
         convolutions = [layer for layer in vae.encoder if isinstance(layer, nn.Conv2d)]
@@ -113,7 +135,7 @@ class QuantizedEncoder(nn.Module):
                 if self.lidar == "1d" and out is not None and not self.layers:
                     self.layers.append(_FloatLayer(conv, out))
                 else:
-                    self.layers.append(_Layer(conv, scale, out))
+                    self.layers.append(Layer(conv, scale, out, weight_levels()))
                 scale = scale if out is None else out
             self.head = nn.Linear(vae.fc1.in_features, vae.fc1.out_features)
             self.head.load_state_dict(vae.fc1.state_dict())

@@ -24,8 +24,9 @@ def small_vae(lidar):
 
 
 @needs_int8
-@pytest.mark.parametrize(("lidar", "share"), [("rings", 0.05), ("1d", 0.05)])
-def test_codes_are_near_those_of_float32(lidar, share, scans):
+@pytest.mark.parametrize("lidar", ["rings", "1d"])
+def test_codes_are_near_those_of_float32(lidar, scans):
+    share = 0.05 if quantized.weight_levels() == 127 else 0.07
     vae = small_vae(lidar)
     obs = observation_from_scan(scans, lidar)
     exact = FrozenEncoder.of(vae)(obs)
@@ -34,6 +35,17 @@ def test_codes_are_near_those_of_float32(lidar, share, scans):
     assert found.dtype == torch.float32
     off = (found - exact).square().mean().sqrt()
     assert 0.0 < float(off) < share * float((exact - exact.mean(0)).square().mean().sqrt())
+
+
+@needs_int8
+@pytest.mark.parametrize("channels", [1, 32])
+def test_the_largest_sums_are_not_cut(channels):
+    """Some processors add pairs of products in 16 bits, which 2 x 255 x 127 does not fit."""
+    conv = torch.nn.Conv2d(channels, 8, 3, bias=False)
+    torch.nn.init.constant_(conv.weight, 0.5)
+    whole = torch.full((1, channels, 5, 5), 255, dtype=torch.uint8).to(memory_format=torch.channels_last)
+    found = quantized.Layer(conv, 1 / 255, None, quantized.weight_levels())(whole)
+    torch.testing.assert_close(found, torch.full((1, 8, 3, 3), channels * 9 * 0.5))
 
 
 @needs_int8
