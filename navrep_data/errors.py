@@ -8,6 +8,7 @@ and texts from outside as they are; :func:`one_line` makes what is shown of them
 from __future__ import annotations
 
 import difflib
+import numbers
 import operator
 import re
 from collections.abc import Iterable
@@ -185,6 +186,43 @@ def whole_number(value: object) -> int | None:
         return operator.index(value)  # type: ignore[arg-type]
     except TypeError:
         return None
+
+
+def check_whole(
+    name: str, value: object, low: int, high: int | None = None, error: type[NavrepDataError] | None = None
+) -> int:
+    """Return `value` as an int, or refuse it.
+
+    Parameters
+    ----------
+    name : str
+        What the caller calls it.
+    value : object
+        Whatever :func:`whole_number` takes.
+    low, high : int
+        The smallest and the largest one; None: no largest one.
+    error : type of NavrepDataError, optional
+        What to raise; a ConfigError by default.
+
+    Raises
+    ------
+    NavrepDataError
+        If it is no whole number, or out of range.
+    """
+    number = whole_number(value)
+    if number is None or number < low or (high is not None and number > high):
+        wanted = f"of at least {low}" if high is None else f"from {low} to {high}"
+        raise (error or ConfigError)(f"{name} is {value!r}, expected a whole number {wanted}.")
+    return number
+
+
+def real_number(value: object) -> int | float | None:
+    """Return an int or float as it is and numpy's as Python's; None for all else, truth values and NaN among it."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Real) or value != value:
+        return None
+    if isinstance(value, int | float):
+        return value
+    return int(value) if isinstance(value, numbers.Integral) else float(value)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -4,11 +4,21 @@ import pickle
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from navrep_data import errors
 from navrep_data.doctor.installation import Check
-from navrep_data.errors import LONGEST_MESSAGE, NavrepDataError, one_line
+from navrep_data.errors import (
+    LONGEST_MESSAGE,
+    ConfigError,
+    NavrepDataError,
+    PolicyError,
+    check_whole,
+    one_line,
+    real_number,
+)
 from navrep_data.shards._fields import Fields
 from navrep_data.shards.verify import Problem
 
@@ -67,3 +77,25 @@ def test_no_other_place_cuts_texts():
         if CUT.search(line)
     ]
     assert found == []
+
+
+@pytest.mark.parametrize("value", [3, np.int64(3), np.uint8(3), np.array(3), torch.tensor(3)])
+def test_whole_numbers_of_any_library_are_plain_ones(value):
+    found = check_whole("n", value, 1, 4)
+    assert (found, type(found)) == (3, int)
+
+
+@pytest.mark.parametrize("value", [0, 5, 3.0, True, "3", None, np.array([3]), np.bool_(True), float("nan")])
+def test_what_is_no_whole_number_in_range_is_refused(value):
+    with pytest.raises(ConfigError, match=r"^n is .*, expected a whole number from 1 to 4"):
+        check_whole("n", value, 1, 4)
+    with pytest.raises(PolicyError, match="of at least 6"):
+        check_whole("n", value, 6, error=PolicyError)
+
+
+def test_real_numbers_are_plain_ones():
+    for value, wanted in ((2, 2), (2.5, 2.5), (np.float32(2.5), 2.5), (np.int64(2), 2), (np.float64(0.5), 0.5)):
+        found = real_number(value)
+        assert found == wanted
+        assert type(found) is type(wanted) or isinstance(value, float)
+    assert [real_number(v) for v in (True, "2", None, float("nan"), np.float32("nan"), [2])] == [None] * 6

@@ -13,7 +13,7 @@ from navrep_data.datasets import _hub_client as client
 from navrep_data.datasets._hub_extras import INDEX_FILE, check_shard_index, read_index
 from navrep_data.datasets._hub_store import ShardStore
 from navrep_data.datasets.hub import fetch_manifest, origin_of, parse_manifest
-from navrep_data.errors import ConfigError, NavrepDataError
+from navrep_data.errors import ConfigError, NavrepDataError, check_whole
 from navrep_data.io import atomic_write_json, cache_dir, is_offline, read_json
 from navrep_data.shards import (
     MANIFEST_FILE,
@@ -241,8 +241,7 @@ def open_stream(
     DatasetNotFoundError, DatasetError, CorruptDataError, HubError, OfflineError
         If there is no such dataset, or it cannot be had.
     """
-    if isinstance(cache_bytes, bool) or not isinstance(cache_bytes, int) or cache_bytes < 1 or ahead < 0:
-        raise ConfigError(f"cache_bytes is {cache_bytes!r} and prefetch {ahead!r}, expected whole numbers above 0.")
+    cache_bytes, ahead = check_whole("cache_bytes", cache_bytes, 1), check_whole("prefetch", ahead, 0)
     at = client.resolve(repo, "dataset", revision, token)
     manifest, there = _manifest(at)
     listed = [entry for entry in manifest.extras if entry.file == INDEX_FILE]

@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 from navrep_data.datasets._batch import Assembler, BatchSpec, Lidar, choose_fields
 from navrep_data.datasets._index import Ints, WindowTable, across_episodes, sequences_of, within_episodes
 from navrep_data.datasets._rows import DiskRows, LoadedRows, select_episodes
-from navrep_data.errors import ConfigError, one_line, whole_number
+from navrep_data.errors import ConfigError, check_whole, one_line, whole_number
 from navrep_data.shards import DatasetFolder, Episodes
 
 Batch = dict[str, torch.Tensor]
@@ -31,9 +31,7 @@ def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
 
 def check_rows(name: str, value: Any) -> int:
     """Return `value` as int, or raise ConfigError unless it is a number of rows of at least 1."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ConfigError(f"{name} is {value!r}, expected a number of rows of at least 1.")
-    return int(value)
+    return check_whole(f"{name} in rows", value, 1)
 
 
 def open_folder(root: str | os.PathLike[str] | DatasetFolder) -> DatasetFolder:

@@ -8,7 +8,7 @@ import torch
 from torch.utils.data import BatchSampler, DataLoader, RandomSampler, SequentialSampler
 
 from navrep_data.datasets._windows import WindowDataset
-from navrep_data.errors import ConfigError, whole_number
+from navrep_data.errors import check_whole
 
 
 def make_loader(
@@ -51,9 +51,7 @@ def make_loader(
     ConfigError
         If the batch size is not at least 1.
     """
-    size = whole_number(batch_size)
-    if size is None or size < 1:
-        raise ConfigError(f"batch_size is {batch_size!r}, expected a whole number of at least 1.")
+    size = check_whole("batch_size", batch_size, 1)
     generator = torch.Generator(device="cpu").manual_seed(seed)
     order: Any = RandomSampler(dataset, generator=generator) if shuffle else SequentialSampler(dataset)
     batches = BatchSampler(order, size, drop_last)

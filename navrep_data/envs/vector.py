@@ -23,7 +23,7 @@ from navrep_data.envs.worlds import (
     observation_space,
     with_length,
 )
-from navrep_data.errors import ConfigError, did_you_mean, whole_number
+from navrep_data.errors import ConfigError, check_whole, did_you_mean
 from navrep_data.schema import Event
 from navrep_data.sim import SimConfig, WorldState
 from navrep_data.sim.raster import Camera, draw_frame
@@ -42,10 +42,7 @@ def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
 
 
 def _at_least_one(name: str, value: int | None) -> int | None:
-    number = whole_number(value)
-    if value is not None and (number is None or number < 1):
-        raise ConfigError(f"{name} is {value}, expected a whole number of at least 1.")
-    return number
+    return None if value is None else check_whole(name, value, 1)
 
 
 class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):

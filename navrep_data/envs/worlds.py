@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from navrep_data.errors import ConfigError, whole_number
+from navrep_data.errors import ConfigError, check_whole
 from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, Event
 from navrep_data.sim import SimConfig, Simulator, make_config, numpy_seed, scale_actions
 from navrep_data.sim import _layout as lay
@@ -123,7 +123,7 @@ class Worlds:
 
     def _number(self, episode: Any) -> int:
         if self._scenarios:
-            return _whole("episode", episode, MAX_NUMPY_SEED)
+            return check_whole("episode", episode, 0, MAX_NUMPY_SEED)
         numpy_seed(self.config.env, episode)  # checks both
         return int(episode)
 
@@ -160,7 +160,7 @@ class Worlds:
         keys = np.zeros(self.n, np.int64)
         for i, seed in enumerate(seeds):
             if seed is not None:
-                keys[i] = _whole("seed", seed, most)
+                keys[i] = check_whole("seed", seed, 0, most)
         if fresh.any():
             keys[fresh] = random.integers(0, most, int(fresh.sum()))
         chosen = given | fresh
@@ -275,10 +275,3 @@ def _places(name: str, value: Any, n: int, sizes: tuple[int, ...]) -> F64:
         return out
     wanted = "x, y [m], or with a heading [rad]" if len(sizes) > 1 else "x, y [m]"
     raise ConfigError(f"{name} is {value}, expected finite {wanted}, for all worlds or a row for each of {n}.")
-
-
-def _whole(name: str, value: Any, most: int) -> int:
-    number = whole_number(value)
-    if number is None or not 0 <= number <= most:
-        raise ConfigError(f"{name} is {value!r}, expected a whole number from 0 to {most}.")
-    return number

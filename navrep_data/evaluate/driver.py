@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data._ray import RayCluster
-from navrep_data.errors import ConfigError, DatasetNotFoundError
+from navrep_data.errors import ConfigError, DatasetNotFoundError, check_whole
 from navrep_data.evaluate import tables
 from navrep_data.evaluate.executors import Job, run, run_on_ray
 from navrep_data.evaluate.policies import NETWORKS, PilotSpec, resolve_policy
@@ -99,8 +99,9 @@ def benchmark(
     ----------
     policies : sequence of str or callable
         Baselines (``goal``, ``random``, ``orca``, ``dwa``), names of the zoo, folders of policies (``./folder``,
-        ``hf://user/name``), ``module:function``, or callables
-        ``(scan (64, 1080), robot_state (64, 5)) -> action (64, 2 or 3)`` in [-1, 1]. `goal` is always played.
+        ``hf://user/name``), ``module:function``, callables
+        ``(scan (64, 1080), robot_state (64, 5)) -> action (64, 2 or 3)`` in [-1, 1], or policies that
+        :func:`navrep_data.zoo.load` returned, fed as by their names. `goal` is always played.
     suite : str
         ``"navreptest"`` or ``"navrep27"``.
     physics : str, optional
@@ -202,8 +203,7 @@ def _check(physics: str, workers: int | None, batch: int | None, policies: Seque
         ("workers", 1 if workers is None else workers, MAX_WORKERS),
         ("batch", 1 if batch is None else batch, 4096),
     ):
-        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
-            raise ConfigError(f"{name} is {value!r}, expected a whole number from 1 to {most}.")
+        check_whole(name, value, 1, most)
     if not policies or isinstance(policies, str):
         raise ConfigError(f"policies is {policies!r}, expected a list of names, for example ['goal', 'dwa'].")
 

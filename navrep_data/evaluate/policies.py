@@ -16,6 +16,7 @@ from navrep_data.evaluate.pilots import FunctionPilot, Pilot, ZooPilot, source_h
 from navrep_data.generate.policy import load_callable
 from navrep_data.io import sha256_file
 from navrep_data.schema import INFERENCE, RANGES, SCALING
+from navrep_data.sim.driving import knows_robots
 from navrep_data.zoo.fetching import HUB_SCHEME
 from navrep_data.zoo.folders import is_path, place_of, policy_files
 from navrep_data.zoo.names import here_hint
@@ -23,7 +24,7 @@ from navrep_data.zoo.names import here_hint
 BASELINES: dict[str, type[Pilot]] = {pilot.name: pilot for pilot in (GoalPilot, RandomPilot, OrcaPilot, DwaPilot)}
 """Policies without weights, by name."""
 
-NETWORKS = ("zoo", "folder")
+NETWORKS = ("zoo", "folder", "object")
 """Kinds of policies for which inference, ranges and scaling mean something."""
 
 
@@ -40,7 +41,8 @@ class PilotSpec:
     variant : str
         What runs of one kind share, such as ``e2e_1d``; the name itself for others.
     kind : str
-        baseline, zoo, folder or function.
+        baseline, zoo, folder, function, or object: a policy that knows robots, such as one that the zoo loaded, given
+        as ``module:name`` or as it is.
     source : str or None
         Where files are looked for first; for a folder, the folder.
     inference : str
@@ -75,6 +77,8 @@ class PilotSpec:
         from navrep_data.zoo import load
 
         torch.set_num_threads(1)  # so that numbers do not depend on the number of cores; workers are the parallelism
+        if self.kind == "object":
+            return ZooPilot(self.function or load_callable(self.name, BASELINES), first_seed, self.scaling)
         place, source = (Path(str(self.source)), None) if self.kind == "folder" else (self.name, self.source)
         policy = load(place, source=source, inference=self.inference, ranges=self.ranges)
         return ZooPilot(policy, first_seed, self.scaling)
@@ -130,14 +134,14 @@ def resolve_policy(
     if not isinstance(policy, str):
         kind = policy if hasattr(policy, "__qualname__") else type(policy)
         name = f"{kind.__module__}:{kind.__qualname__}"
-        return PilotSpec(name, "scan", name, "function", files=_hashes(policy), function=policy)
+        return replace(_from_callable(name, policy, ranges, scaling), function=policy)
     if policy in BASELINES:
         pilot = BASELINES[policy]
         return PilotSpec(policy, (on_maps and pilot.sees_on_maps) or pilot.sees, policy, "baseline")
     if is_path(policy):
         return _from_folder(policy, how)
     if ":" in policy:
-        return PilotSpec(policy, "scan", policy, "function", files=_hashes(load_callable(policy, BASELINES)))
+        return _from_callable(policy, load_callable(policy, BASELINES), ranges, scaling)
     return _from_zoo(policy, None if source is None else os.fspath(source), how)
 
 
@@ -164,6 +168,16 @@ def _not_released(name: str) -> ConfigError:
 def _hashes(function: Callable[..., Any]) -> dict[str, str]:
     digest = source_hash(function)
     return {"source": digest} if digest else {}
+
+
+def _from_callable(name: str, function: Callable[..., Any], ranges: str, scaling: str | None) -> PilotSpec:
+    spec = PilotSpec(name, "scan", name, "function", files=_hashes(function))
+    if not knows_robots(function):
+        return spec
+    if ranges != "contract":
+        raise ConfigError(f"ranges is {ranges!r}, but {name} is loaded already: give zoo.load the ranges, not here.")
+    own = {what: getattr(function, what, getattr(spec, what)) for what in ("inference", "ranges")}
+    return replace(spec, kind="object").fed(own["inference"], own["ranges"], _scaling(own["ranges"], scaling))
 
 
 def _from_folder(name: str, how: dict[str, str]) -> PilotSpec:

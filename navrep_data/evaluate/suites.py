@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from navrep_data.errors import ConfigError, UnknownNameError, did_you_mean
+from navrep_data.errors import ConfigError, UnknownNameError, check_whole, did_you_mean
 from navrep_data.evaluate.map_worlds import ScenarioWorlds
 from navrep_data.evaluate.worlds import PolygonWorlds, Worlds
 from navrep_data.io import json_bytes
@@ -106,15 +106,8 @@ class Suite:
         """
         rounds = self.rounds if episodes is None else episodes
         each = "" if len(self.scenarios) == 1 else " per scenario"
-        if isinstance(first_round, bool) or not isinstance(first_round, int) or not 0 <= first_round < self.max_rounds:
-            raise ConfigError(
-                f"first_round is {first_round!r}, expected a whole number from 0 to {self.max_rounds - 1} in "
-                f"{self.name}."
-            )
-        if isinstance(rounds, bool) or not isinstance(rounds, int) or not 1 <= rounds <= self.max_rounds:
-            raise ConfigError(
-                f"episodes is {rounds!r}, expected a whole number from 1 to {self.max_rounds}{each} in {self.name}."
-            )
+        first_round = check_whole(f"{self.name}: first_round", first_round, 0, self.max_rounds - 1)
+        rounds = check_whole(f"{self.name}: episodes{each}", rounds, 1, self.max_rounds)
         if first_round + rounds > self.max_rounds:
             raise ConfigError(
                 f"Rounds {first_round} to {first_round + rounds - 1} were asked for, {self.name} ends with round "

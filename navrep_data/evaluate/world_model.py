@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from navrep_data.datasets import SequenceDataset
-from navrep_data.errors import ConfigError, DatasetMismatchError
+from navrep_data.errors import ConfigError, DatasetMismatchError, check_whole
 from navrep_data.models.vae import VAE
 from navrep_data.models.world_model import WorldModel
 from navrep_data.schema import SensorContract
@@ -136,8 +136,7 @@ def world_model_error(
             f"{name or 'This'} is a {type(model).__name__}, expected a world model such as transformer_1d."
         )
     window = getattr(model.config, "context", 32)
-    if type(steps) is not int or not 1 <= steps <= window - 1:
-        raise ConfigError(f"steps is {steps!r}, expected 1 to {window - 1}: dream and context share {window} rows.")
+    steps = check_whole("steps", steps, 1, window - 1)  # dream and context share the rows of a window
     context = min(CONTEXT, window - steps + 1)
     dataset = _open(model.lidar, model.config.action_alignment, Path(data), split, window)
     sums = _Sums(steps)

@@ -10,11 +10,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from navrep_data.errors import ConfigError, DatasetMismatchError
+from navrep_data.errors import ConfigError, DatasetMismatchError, check_whole
 from navrep_data.generate.executors import EXECUTORS, LocalExecutor, RayExecutor
 from navrep_data.generate.maps import named_from
 from navrep_data.generate.parts import Part, parse_part
-from navrep_data.generate.plan import Request, check_count, check_folder, check_same, check_settings, make_request
+from navrep_data.generate.plan import Request, check_folder, check_same, check_settings, make_request
 from navrep_data.generate.policy import load_callable, make_policy
 from navrep_data.generate.run import Run, Say, silent
 from navrep_data.generate.storage import check_url
@@ -172,10 +172,10 @@ def generate(
         curriculum="constant", maps=None if maps is None else tuple(maps),
     )  # fmt: skip
     env = config.env  # in the spelling that is stored
-    check_seed(seed)
+    seed = check_seed(seed)
     part = _check_place(executor, address, storage, shard_range)
     if workers is not None:
-        check_count("workers", workers, 1, MAX_WORKERS)
+        workers = check_whole("--workers", workers, 1, MAX_WORKERS)
     chosen = make_policy(policy, policy_batch)
     if not chosen.scripted and chosen.function is None:
         load_callable(chosen.name)  # fail here, not in a worker

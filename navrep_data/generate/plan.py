@@ -17,6 +17,7 @@ from navrep_data.errors import (
     DiskSpaceError,
     FolderInUseError,
     FolderNotWritableError,
+    check_whole,
 )
 from navrep_data.generate.maps import check_unchanged
 from navrep_data.generate.parts import PARTS, Part
@@ -94,13 +95,6 @@ def bytes_per_row(spec: DatasetSpec) -> float:
     return estimate / rows
 
 
-def check_count(name: str, value: Any, low: int, high: int) -> int:
-    """Return `value` if it is a whole number in [low, high], else raise a ConfigError that names the flag."""
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise ConfigError(f"--{name} is {value!r}, expected a whole number from {low} to {high:,}.")
-    return value
-
-
 def check_settings(
     config: SimConfig, length: int, scan_dtype: str | None, rings: bool, humans: bool
 ) -> RolloutSettings:
@@ -116,7 +110,7 @@ def check_settings(
     check_rings(config, rings)
     chosen = scan_dtype or ("float32" if far else "uint16")
     return RolloutSettings(
-        check_count("length", length, 1, MAX_LENGTH), chosen, rings, humans and config.max_others > 0
+        check_whole("--length", length, 1, MAX_LENGTH), chosen, rings, humans and config.max_others > 0
     )
 
 
@@ -125,7 +119,7 @@ def make_request(
     shard_size: int | None, storage: str | None = None, part: Part | None = None,
 ) -> Request:  # fmt: skip
     """Return the checked request; chooses the shard size where none is given."""
-    check_count("n", n, 1, MAX_SEQUENCES)
+    n = check_whole("--n", n, 1, MAX_SEQUENCES)
     columns = tuple(
         name
         for name in _GENERATED_COLUMNS
@@ -135,7 +129,8 @@ def make_request(
     largest = largest_shard(spec)
     if shard_size is None:
         shard_size = min(largest, max(policy.batch, DEFAULT_SHARD_ROWS // settings.length, 1))
-    elif check_count("shard-size", shard_size, 1, MAX_SEQUENCES) > largest:
+    shard_size = check_whole("--shard-size", shard_size, 1, MAX_SEQUENCES)
+    if shard_size > largest:
         raise ConfigError(
             f"--shard-size is {shard_size}, expected at most {largest} sequences of {settings.length} rows: a shard is "
             f"built in memory and may take {MAX_SHARD_BYTES >> 20} MiB."

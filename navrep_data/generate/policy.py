@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from navrep_data.errors import PolicyError
+from navrep_data.errors import PolicyError, check_whole
 from navrep_data.sim import (
     SCRIPTED,
     CallableMapRollout,
@@ -63,8 +63,7 @@ def make_policy(policy: str | PolicyFunction, batch: int) -> PolicySpec:
     PolicyError
         If the batch size cannot be used.
     """
-    if isinstance(batch, bool) or not isinstance(batch, int) or not 1 <= batch <= 4096:
-        raise PolicyError(f"policy_batch is {batch!r}, expected a whole number from 1 to 4096.")
+    batch = check_whole("policy_batch", batch, 1, 4096, PolicyError)
     if callable(policy):
         kind = policy if hasattr(policy, "__qualname__") else type(policy)
         return PolicySpec(f"{kind.__module__}:{kind.__qualname__}", batch, policy)

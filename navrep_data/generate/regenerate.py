@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from navrep_data.errors import ConfigError, DatasetError
+from navrep_data.errors import ConfigError, DatasetError, check_whole
 from navrep_data.generate.maps import find_maps
 from navrep_data.generate.policy import PolicySpec, make_rollout
 from navrep_data.generate.worker import DatasetSpec, new_writer
@@ -135,8 +135,7 @@ def regenerate(root: Path | str, k: int, seed: int | None = None, maps: Sequence
         If a shard is damaged.
     """
     root = Path(root)
-    if isinstance(k, bool) or not isinstance(k, int) or k < 1:
-        raise ConfigError(f"--regenerate is {k!r}, expected a whole number of at least 1.")
+    k = check_whole("--regenerate", k, 1)
     with DatasetFolder(root) as folder:
         manifest = folder.manifest
         spec = recipe_of(root, manifest, maps)

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
-from navrep_data.errors import ConfigError, did_you_mean
+from navrep_data.errors import ConfigError, check_whole, did_you_mean
 from navrep_data.schema import N_RAYS, RINGS_SHAPE
 
 LIDARS = ("rings", "1d")
@@ -33,10 +33,8 @@ class ModelConfig:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             limit = _LARGEST_OF.get(field.name, _LARGEST)
-            if field.type == "int" and (type(value) is not int or not 1 <= value <= limit):
-                raise ConfigError(
-                    f"{field.name} of a {self.kind} is {value!r}, expected a whole number from 1 to {limit}."
-                )
+            if field.type == "int":
+                object.__setattr__(self, field.name, check_whole(f"{field.name} of a {self.kind}", value, 1, limit))
             if field.type == "bool" and type(value) is not bool:
                 raise ConfigError(f"{field.name} of a {self.kind} is {str(value)!r}, expected true or false.")
         for name, allowed in (("lidar", LIDARS), ("action_alignment", ACTION_ALIGNMENTS)):

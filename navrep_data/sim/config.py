@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from navrep_data.errors import ConfigError, did_you_mean
+from navrep_data.errors import ConfigError, check_whole, did_you_mean, real_number
 from navrep_data.schema import SensorContract
 from navrep_data.sim import _layout as lay
 from navrep_data.sim._maps import map_file
@@ -32,6 +32,10 @@ MAX_HUMANS = 60
 MAX_OBSTACLES = 20
 MAX_ROBOTS = 10
 MAX_RAYS = 16384
+_LIMITS = {
+    "polygon_scale": (0.1, 4.0), "time_limit": (0.0, 3600.0), "max_damage": (0.001, 1e6), "goal_radius": (0.01, 10.0),
+    "scan_noise": (0.0, 10.0), "scan_dropout": (0.0, 1.0),
+}  # fmt: skip
 
 Triple = tuple[float, float, float]
 
@@ -135,29 +139,27 @@ class SimConfig:
         _one_of("physics", self.physics, PHYSICS)
         _one_of("crossing", self.crossing, CROSSINGS)
         _one_of("rendering", self.rendering, RENDERINGS)
-        _whole("humans", self.humans, 0, MAX_HUMANS)
-        _whole("obstacles", self.obstacles, 0, MAX_OBSTACLES)
-        _number("polygon_scale", self.polygon_scale, 0.1, 4.0)
-        _number("time_limit", self.time_limit, self.sensor.dt, 3600.0)
-        _check_sensor(self.sensor)
+        object.__setattr__(self, "sensor", _checked(self.sensor))
+        wholes = {"humans": (0, MAX_HUMANS), "obstacles": (0, MAX_OBSTACLES), "robots": (1, MAX_ROBOTS)}
+        for name, (low, high) in wholes.items():
+            object.__setattr__(self, name, check_whole(name, getattr(self, name), low, high))
+        for name, limits in _LIMITS.items():
+            if name != "goal_radius" or self.goal_radius is not None:
+                object.__setattr__(self, name, _number(name, getattr(self, name), *limits))
+        if self.time_limit < self.sensor.dt:
+            raise ConfigError(f"time_limit is {self.time_limit!r}, expected a step of {self.sensor.dt} s or more.")
         _one_of("world", self.world, WORLDS)
         for name in ("maps", "scenarios"):
             object.__setattr__(self, name, _names(name, getattr(self, name)))
         for name in self.scenarios:
             get_scenario(name)
         _one_of("human_policy", self.human_policy, HUMAN_POLICIES)
-        _whole("robots", self.robots, 1, MAX_ROBOTS)
         _one_of("drive", self.drive, DRIVES)
         _one_of("inertia", self.inertia, INERTIAS)
         for name in ("max_velocity", "robot_acceleration", "robot_jerk"):
             object.__setattr__(self, name, _triple(name, getattr(self, name)))
         _one_of("on_collision", self.on_collision, ON_COLLISION)
-        _number("max_damage", self.max_damage, 0.001, 1e6)
-        if self.goal_radius is not None:
-            _number("goal_radius", self.goal_radius, 0.01, 10.0)
         _one_of("curriculum", self.curriculum, CURRICULA)
-        _number("scan_noise", self.scan_noise, 0.0, 10.0)
-        _number("scan_dropout", self.scan_dropout, 0.0, 1.0)
         check_combinations(self)
         object.__setattr__(self, "_map_files", tuple(map_file(name) for name in self.maps))
 
@@ -255,17 +257,20 @@ def complete(values: dict[str, Any]) -> dict[str, Any]:
     return {**_LATER, **values}
 
 
-def _check_sensor(sensor: SensorContract) -> None:
-    _whole("sensor.n_rays", sensor.n_rays, 1, MAX_RAYS)
-    _number("sensor.range_max", sensor.range_max, 0.1, 1000.0)
-    _number("sensor.dt", sensor.dt, 0.01, 1.0)
-    _number("sensor.angle_min", sensor.angle_min, -2 * math.pi, 2 * math.pi)
-    _number("sensor.angle_increment", sensor.angle_increment, 1e-6, 2 * math.pi)
+def _checked(sensor: SensorContract) -> SensorContract:
+    sensor = SensorContract(
+        check_whole("sensor.n_rays", sensor.n_rays, 1, MAX_RAYS),
+        _number("sensor.angle_min", sensor.angle_min, -2 * math.pi, 2 * math.pi),
+        _number("sensor.angle_increment", sensor.angle_increment, 1e-6, 2 * math.pi),
+        _number("sensor.range_max", sensor.range_max, 0.1, 1000.0),
+        _number("sensor.dt", sensor.dt, 0.01, 1.0),
+    )
     if (sensor.n_rays - 1) * sensor.angle_increment > 2 * math.pi:
         raise ConfigError(
             f"sensor: {sensor.n_rays} rays x {sensor.angle_increment} rad are more than a full turn; "
             "expected (n_rays - 1) x angle_increment <= 2 pi."
         )
+    return sensor
 
 
 def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
@@ -273,19 +278,16 @@ def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
         raise ConfigError(f"{name} is {value!r}, expected one of: {', '.join(known)}.{did_you_mean(str(value), known)}")
 
 
-def _whole(name: str, value: int, low: int, high: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise ConfigError(f"{name} is {value!r}, expected a whole number from {low} to {high}.")
-
-
-def _number(name: str, value: float, low: float, high: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+def _number(name: str, value: object, low: float, high: float) -> float:
+    number = real_number(value)
+    if number is None or not low <= number <= high:
         raise ConfigError(f"{name} is {value!r}, expected a number from {low:g} to {high:g}.")
+    return number
 
 
 def _triple(name: str, value: Any) -> Triple:
     numbers = tuple(value) if isinstance(value, (list, tuple, np.ndarray)) else ()
-    if len(numbers) != 3 or not all(isinstance(v, (int, float)) and 0.0 < v <= 1000.0 for v in numbers):
+    if len(numbers) != 3 or not all(0.0 < (real_number(v) or 0.0) <= 1000.0 for v in numbers):
         raise ConfigError(f"{name} is {value!r}, expected three numbers above 0 and at most 1000: x, y, rotation.")
     return (float(numbers[0]), float(numbers[1]), float(numbers[2]))
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageColor, ImageDraw
 
-from navrep_data.errors import ConfigError
+from navrep_data.errors import check_whole
 from navrep_data.schema import SensorContract
 from navrep_data.sim.drawing import GOAL, HUMAN, OBSTACLE, RAY, ROBOT, scan_points
 from navrep_data.sim.gridmap import GridMap
@@ -130,8 +130,7 @@ class Canvas:
     """
 
     def __init__(self, camera: Camera, size: int) -> None:
-        if isinstance(size, bool) or not isinstance(size, int) or not _MIN_SIZE <= size <= _MAX_SIZE:
-            raise ConfigError(f"size is {size!r}, expected a whole number of pixels from {_MIN_SIZE} to {_MAX_SIZE}.")
+        size = check_whole("size in pixels", size, _MIN_SIZE, _MAX_SIZE)
         self._camera = camera
         self._size = size * _OVERSAMPLING
         self._scale = self._size / (2 * camera.half)

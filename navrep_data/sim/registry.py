@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from navrep_data.errors import ConfigError, UnknownNameError, did_you_mean
+from navrep_data.errors import ConfigError, UnknownNameError, check_whole, did_you_mean
 from navrep_data.registration import VERSION, camel_case, spelled
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.map_environments import MAP_ENVIRONMENTS, original_fields
@@ -81,10 +79,9 @@ def numpy_seed(env: str, episode: int) -> int:
     env = environment_name(env)
     if env not in _NUMBERED:
         raise ConfigError(f"Environment {env!r} has no numbered episodes; those that do: {', '.join(_NUMBERED)}.")
-    if isinstance(episode, bool) or not isinstance(episode, (int, np.integer)) or episode < 0:
-        raise ConfigError(f"episode is {episode!r}, expected a whole number from 0.")
+    episode = check_whole("episode", episode, 0)
     first, count = _NUMBERED[env]
-    return first + int(episode) % count
+    return first + episode % count
 
 
 def gymnasium_id(name: str) -> str:

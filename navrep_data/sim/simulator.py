@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from navrep_data.errors import ConfigError, SimulationError
+from navrep_data.errors import ConfigError, SimulationError, check_whole
 from navrep_data.schema import ACTION_SIZE, HUMAN_FIELDS, ROBOT_STATE_SIZE, Event
 from navrep_data.sim import _batch, _step
 from navrep_data.sim import _layout as lay
@@ -33,9 +33,7 @@ MAX_NUMPY_SEED = 2**32 - 1
 
 def check_seed(seed: int) -> int:
     """Return `seed` if it can start a stream: a whole number from 0 to 2^63 - 1."""
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed <= MAX_SEED:
-        raise ConfigError(f"seed is {seed!r}, expected a whole number from 0 to {MAX_SEED}.")
-    return int(seed)
+    return check_whole("seed", seed, 0, MAX_SEED)
 
 
 def no_world(config: SimConfig, which: str = "") -> SimulationError:

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from navrep_data.errors import ConfigError
+from navrep_data.errors import ConfigError, check_whole, real_number
 from navrep_data.models.controllers import LEAST_STD, MOST_STD
 from navrep_data.sim import SimConfig, make_config
 from navrep_data.train.settings import environment_of_settings
@@ -125,13 +125,16 @@ class ControllerRecipe:
                 raise ConfigError(f"{name} is {str(getattr(self, name))!r}, expected one of: {', '.join(allowed)}.")
         for field in dataclasses.fields(self):
             value: Any = getattr(self, field.name)
-            if field.type == "int" and (type(value) is not int or value < (0 if field.name == "seed" else 1)):
-                raise ConfigError(f"{field.name} is {value!r}, expected a whole number of at least 1.")
+            if field.type == "int":
+                object.__setattr__(self, field.name, check_whole(field.name, value, 0 if field.name == "seed" else 1))
             if field.type == "bool" and type(value) is not bool:
                 raise ConfigError(f"{field.name} is {value!r}, expected true or false.")
             most = _MOST.get(field.name, 1e6)
-            if field.type == "float" and (type(value) not in (int, float) or not 0 <= value <= most):
-                raise ConfigError(f"{field.name} is {value!r}, expected a number from 0 to {most:g}.")
+            if field.type == "float":
+                number = real_number(value)
+                if number is None or not 0 <= number <= most:
+                    raise ConfigError(f"{field.name} is {value!r}, expected a number from 0 to {most:g}.")
+                object.__setattr__(self, field.name, number)
         if self.refit and self.features != "z":
             raise ConfigError(f"refit is for controllers on z, this is a recipe for {self.features}: leave it out.")
         if not 0.0 < self.least_std <= MOST_STD:

@@ -127,6 +127,11 @@ def train_controller(
         If weights become NaN; the last good checkpoint is kept.
     """
     out = Path(out)
+    if report is not None and environment(recipe).scenarios:
+        report(
+            "Episodes of this training are drawn from the scenarios of navrep27: what it scores in that suite says "
+            "nothing of places that it has not seen."
+        )
     torch.manual_seed(recipe.seed)
     folder = state.last_folder(out) if resume else None
     network = _saved_network(folder, recipe, model) if folder else _first_network(recipe, model, init, resume, report)

@@ -10,7 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from navrep_data.errors import ConfigError, did_you_mean
+from navrep_data.errors import ConfigError, did_you_mean, real_number, whole_number
 from navrep_data.io import read_json
 from navrep_data.models.config import ACTION_ALIGNMENTS, LIDARS
 from navrep_data.train.passes import PRECISIONS
@@ -194,15 +194,15 @@ class Recipe:
                 raise ConfigError(f"{name} is {str(getattr(self, name))!r}, expected one of: {', '.join(allowed)}.")
         for field in dataclasses.fields(self):
             value: Any = getattr(self, field.name)
-            wanted: tuple[type, ...] = {"int": (int,), "float": (int, float), "bool": (bool,), "str": (str,)}[
-                str(field.type)
-            ]
-            if not isinstance(value, wanted) or (type(value) is bool and field.type != "bool"):
-                raise ConfigError(f"{field.name} of a recipe is {str(value)!r}, expected {field.type}.")
+            if field.type in ("bool", "str"):
+                if type(value).__name__ != field.type:
+                    raise ConfigError(f"{field.name} of a recipe is {str(value)!r}, expected {field.type}.")
+                continue
+            number = whole_number(value) if field.type == "int" else real_number(value)
             low, high = _LIMITS.get(field.name, (-math.inf, math.inf))
-            number: Any = getattr(self, field.name)
-            if field.type in ("int", "float") and not low <= number <= high:
-                raise ConfigError(f"{field.name} of a recipe is {value}, expected {low:g} to {high:g}.")
+            if number is None or not low <= number <= high:
+                raise ConfigError(f"{field.name} of a recipe is {value!r}, expected {field.type}, {low:g} to {high:g}.")
+            object.__setattr__(self, field.name, number)
 
         if self.freeze_v and self.model not in ("joint", "transformer"):
             raise ConfigError(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from navrep_data.datasets import SequenceDataset
-from navrep_data.errors import ConfigError
+from navrep_data.errors import ConfigError, check_whole
 from navrep_data.models.modular import ModularWorldModel
 from navrep_data.models.world_model import CONTEXT, WorldModel
 from navrep_data.observations import rings_to_scan
@@ -95,8 +95,7 @@ class DreamEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise ConfigError(f"model is a {type(found).__name__}, expected a world model such as transformer_1d.")
         if not 0.0 <= temperature <= 10.0:
             raise ConfigError(f"temperature is {temperature}, expected 0 to 10.")
-        if type(real_rows) is not int or not 1 <= real_rows < CONTEXT:
-            raise ConfigError(f"real_rows is {real_rows!r}, expected 1 to {CONTEXT - 1}.")
+        real_rows = check_whole("real_rows", real_rows, 1, CONTEXT - 1)
         if not 0.0 < goal_radius <= RANGE_MAX:
             raise ConfigError(f"goal_radius is {goal_radius}, expected more than 0 and at most {RANGE_MAX} m.")
         if render_mode not in (None, "rgb_array"):

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from navrep_data.errors import ArrayError, CheckpointError, ConfigError, PolicyError
+from navrep_data.errors import ArrayError, CheckpointError, ConfigError, PolicyError, check_whole
 from navrep_data.models.checkpoint import building
 from navrep_data.models.config import OBSERVATION_SHAPES
 from navrep_data.models.controllers import ActorCritic, EndToEnd
@@ -266,9 +266,7 @@ class Policy:
             if self._stream is not None:
                 self._stream.reset(chosen)
             return
-        n = max(1, n) if batch_size is None else batch_size
-        if type(n) is not int or n < 1:
-            raise PolicyError(f"batch_size is {n!r}, expected a whole number of at least 1.")
+        n = check_whole("batch_size", max(1, n) if batch_size is None else batch_size, 1, error=PolicyError)
         self._last = torch.zeros(n, ACTION_SIZE, dtype=torch.float32, device=self.device)
         self._waiting, self._fresh = None, torch.ones(n, dtype=torch.bool, device=self.device)
         self._noise = Noise.seeded(self.seed, self.device) if self.inference == "as_released" else None

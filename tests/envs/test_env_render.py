@@ -158,7 +158,7 @@ def test_thin_walls_survive_shrinking():
 def test_wrong_sizes_are_refused(size):
     env = NavRepEnv("navrep-test")
     env.reset()
-    with pytest.raises(ConfigError, match="expected a whole number of pixels from 16 to 4096"):
+    with pytest.raises(ConfigError, match="expected a whole number from 16 to 4096"):
         env.frame(size)
 
 

@@ -89,6 +89,26 @@ def test_ranges_as_released_run_the_authors_software_as_it_is():
     assert not policy.told  # their memories were fed the network's own action
 
 
+class Loaded(Recording):
+    """As somebody's module holds a policy that knows robots, ready to be named."""
+
+    def __call__(self, scan, state):
+        return self.act(scan, state)
+
+
+loaded = Loaded()
+
+
+def test_a_loaded_policy_in_a_module_is_fed_as_by_its_name():
+    for spec in (resolve_policy(loaded), resolve_policy(f"{__name__}:loaded")):
+        assert (spec.kind, spec.settings()) == ("object", {"ranges": "contract", "scaling": "robot"})
+        assert isinstance(spec.make(1000), ZooPilot)
+    assert resolve_policy(loaded, scaling="none").settings()["scaling"] == "none"
+    assert resolve_policy(loaded.act).kind == "function"
+    with pytest.raises(ConfigError, match="loaded already"):
+        resolve_policy(loaded, ranges="as_released")
+
+
 @pytest.mark.parametrize(
     ("how", "words"),
     [

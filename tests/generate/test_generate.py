@@ -89,7 +89,8 @@ def test_any_number_of_workers_writes_the_same_bytes(reference, tmp_path, worker
 
 def test_extending_gives_the_bytes_of_a_larger_run(reference, tmp_path):
     root = tmp_path / "d"
-    generate(n=3, out=root, **SMALL)
+    # numbers of numpy are numbers
+    generate(n=np.int64(3), out=root, workers=np.uint8(1), **{name: np.int64(value) for name, value in SMALL.items()})
     result = generate(n=7, out=root, **SMALL)
     assert result.new_rows == (7 - 3) * 30
     assert tree(root) == reference[2]

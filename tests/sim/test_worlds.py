@@ -1,9 +1,12 @@
 """Procedural worlds: what the recipe promises."""
 
+import json
+
 import numpy as np
 import pytest
 
 from navrep_data.errors import ConfigError, UnknownNameError
+from navrep_data.schema import SensorContract
 from navrep_data.sim import SimConfig, Simulator, environment_names, make_config
 from navrep_data.sim import _layout as lay
 
@@ -134,3 +137,13 @@ def test_config_survives_json():
     assert SimConfig.from_dict(config.to_dict()) == config
     with pytest.raises(ConfigError, match="does not fit"):
         SimConfig.from_dict({**config.to_dict(), "wheels": 4})
+
+
+def test_numbers_of_numpy_are_stored_as_plain_ones():
+    given = {"humans": np.int64(7), "obstacles": np.uint8(2), "time_limit": np.float32(20), "robot_jerk": np.ones(3)}
+    plain = {"humans": 7, "obstacles": 2, "time_limit": 20.0, "robot_jerk": [1, 1, 1]}
+    found = make_config("soadrl", **given)
+    assert found == make_config("soadrl", **plain)
+    assert json.dumps(found.full_dict()) == json.dumps(make_config("soadrl", **plain).full_dict())
+    sensor = SensorContract(n_rays=np.int32(180), angle_increment=np.float32(0.03), range_max=np.int64(10))
+    assert type(json.loads(json.dumps(make_config("soadrl", sensor=sensor).to_dict()))["sensor"]["n_rays"]) is int

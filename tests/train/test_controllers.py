@@ -449,6 +449,16 @@ def test_end_to_end(few_episodes, tmp_path):
     assert policy.act(*Simulator(environment(recipe), 3, seed=1).observe()).shape == (3, 3)
 
 
+@pytest.mark.parametrize("env", ["ian", "navrep-train"])
+def test_training_on_scenarios_of_a_suite_is_said(env, tmp_path):
+    said = []
+    with pytest.raises(ConfigError):  # there is no model, which is found out after what is said
+        controllers.train_controller(
+            default_controller_recipe("z", "1d").replace(env=env), tmp_path / "c", report=said.append
+        )
+    assert [("navrep27" in line) for line in said] == [True] * (env == "ian")
+
+
 @pytest.mark.slow
 def test_a_network_is_continued(few_episodes, tmp_path):
     model = world_model()
