@@ -142,7 +142,12 @@ def resolve_policy(
         return _from_folder(policy, how)
     if ":" in policy:
         return _from_callable(policy, load_callable(policy, BASELINES), ranges, scaling)
-    return _from_zoo(policy, None if source is None else os.fspath(source), how)
+    return _from_zoo(policy, None if source is None else _from_anywhere(os.fspath(source)), how)
+
+
+def _from_anywhere(source: str) -> str:
+    """Return an address as it is and a folder as workers find it, whose working folders may be others."""
+    return source if "://" in source else str(Path(source).expanduser().absolute())
 
 
 def _scaling(ranges: str, scaling: str | None) -> str:

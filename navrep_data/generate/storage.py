@@ -176,6 +176,12 @@ def check_url(url: str) -> None:
             f"--storage is {url}, expected a URL such as s3://bucket/name; a folder that all nodes share is given "
             "by --out."
         )
+    scheme, _, path = url.partition("://")
+    if scheme in ("file", "local") and not path.startswith("/"):
+        raise ConfigError(
+            f"--storage is {url}, which means another folder wherever it is read; expected a whole path: "
+            f"{scheme}://{Path(path).absolute()}"
+        )
     open_url(url)
 
 

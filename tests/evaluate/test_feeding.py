@@ -109,6 +109,13 @@ def test_a_loaded_policy_in_a_module_is_fed_as_by_its_name():
         resolve_policy(loaded, ranges="as_released")
 
 
+def test_workers_in_other_folders_find_the_weights(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "weights").mkdir()
+    assert resolve_policy("e2e_1d.v1", "weights").source == str(tmp_path / "weights")
+    assert resolve_policy("e2e_1d.v1", "hf://user/name").source == "hf://user/name"
+
+
 @pytest.mark.parametrize(
     ("how", "words"),
     [

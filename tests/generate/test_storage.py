@@ -101,6 +101,7 @@ def test_workers_whose_files_cannot_be_seen_from_here(tmp_path, url, monkeypatch
     ("url", "error", "message"),
     [
         ("data/shared", ConfigError, "a folder that all nodes share is given by --out"),
+        ("file://data/shared", ConfigError, "expected a whole path: file:///"),
         ("nosuch://x", ConfigError, "Protocol not known: nosuch"),
         ("s3://bucket/name", MissingExtraError, "s3fs"),
     ],
