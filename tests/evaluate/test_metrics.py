@@ -16,7 +16,7 @@ from navrep_data.evaluate.metrics import (
     personal_space_time,
     spl,
 )
-from navrep_data.evaluate.statistics import bootstrap, spread, wilson
+from navrep_data.evaluate.statistics import bootstrap, bootstrap_ratio, spread, wilson
 
 DT = 0.2
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]
@@ -112,6 +112,23 @@ def test_bootstrap_is_seeded_leaves_out_nan_and_covers_as_the_normal_does():
     assert (low, high) == pytest.approx((mean - half, mean + half), abs=0.1 * half)
     assert bootstrap(values, seed=1) != (mean, low, high)
     assert all(math.isnan(x) for x in bootstrap([math.nan]))
+
+
+@pytest.mark.parametrize("n", [1, 3, 200, 1081])
+def test_bootstrap_is_one_resample_after_the_other(n):
+    """In a plain loop; 1,081 values are drawn in several parts, of which the last is shorter."""
+    rng = np.random.default_rng(n)
+    values, below = rng.normal(size=n), rng.integers(0, 2, n) * rng.uniform(size=n)
+    below[0] = 1.0
+    draws, means, ratios = np.random.default_rng(4), [], []
+    for _ in range(2000):
+        chosen = draws.integers(0, n, n)
+        means.append(values[chosen].mean())
+        if below[chosen].sum() != 0.0:
+            ratios.append(values[chosen].sum() / below[chosen].sum())
+    assert bootstrap(values, seed=4) == (values.mean(), *np.quantile(means, [0.025, 0.975]))
+    ends = np.quantile(ratios, [0.025, 0.975])
+    assert bootstrap_ratio(values, below, seed=4) == (values.sum() / below.sum(), *ends)
 
 
 def test_spread():
