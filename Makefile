@@ -26,7 +26,7 @@ demo: $(STAMP)  ## Generate a small dataset, print its summary, load windows thr
 	$(BIN)/python examples/load_windows.py $(DEMO)
 
 test: $(STAMP)  ## Run the whole test suite, slow tests included.
-	$(BIN)/python -m pytest -m "slow or not slow" --numprocesses $(JOBS) --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m "slow or not slow" --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder $(PYTEST_ARGS)
 
 check: $(STAMP)  ## Format, lint, types, import contracts.
 	$(BIN)/ruff format --check .
@@ -50,7 +50,7 @@ coverage: $(STAMP)  ## Line coverage of sim and observations, measured on plain 
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) --numprocesses $(JOBS) --cov=navrep_data.sim --cov=navrep_data.observations \
 	  --cov-report=term --cov-fail-under=95 $(PYTEST_ARGS)
 
-kill-test: $(STAMP)  ## 200 random SIGKILLs of generate (CI runs 10).
+kill-test: $(STAMP)  ## 200 random SIGKILLs of generate (CI runs 6).
 	NAVREP_DATA_KILLS=200 $(BIN)/python -m pytest -m slow tests/generate/test_kill.py -s
 
 # seconds in all; FUZZ_ARGS="--only shard map" for some readers, --seed N to see a finding again

@@ -1,5 +1,6 @@
 """Fixtures for all tests; and no test reaches another machine."""
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -11,6 +12,23 @@ import loopback_only
 from recorded import AUTHORS
 
 loopback_only.install()
+
+
+def pytest_sessionstart(session):
+    """Where several processes are about to run tests: compile once what each of them would compile."""
+    if getattr(session.config.option, "numprocesses", None):
+        script = str(Path(__file__).with_name("compile_kernels.py"))
+        compiling = [subprocess.Popen([sys.executable, script, half]) for half in ("polygons", "maps")]
+        assert [process.wait() for process in compiling] == [0, 0]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Tests of a file share its fixtures, so they share a process; pages of the docs have none and take longest."""
+    for item in items:
+        page = item.name[:-1].partition("test_code_blocks_run[")[2]
+        item.add_marker(pytest.mark.xdist_group(page or item.nodeid.partition("::")[0]))
+    items.sort(key=lambda item: not item.name.startswith("test_code_blocks_run"))  # stable: these first
 
 
 @pytest.fixture(scope="session")

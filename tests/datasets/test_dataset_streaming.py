@@ -104,8 +104,7 @@ def test_workers_share_the_windows(root, expected, batch_size):
 
 @pytest.mark.slow
 def test_spawned_workers_share_the_windows(root, expected):
-    for workers in (2, 4):
-        assert Counter(ids(load(stream(root), workers, context="spawn"))) == expected
+    assert Counter(ids(load(stream(root), 2, context="spawn"))) == expected
 
 
 def test_batches_are_full_across_buffers(root, expected):
@@ -156,7 +155,7 @@ def test_resume_in_one_process(root, batch_size):
     dataset = stream(root, batch_size=batch_size)
     dataset.set_epoch(3)
     whole = [ids([b]) for b in dataset]
-    for stop in range(len(whole) + 1):
+    for stop in sorted({0, 1, *range(2, len(whole), 7), len(whole) - 1, len(whole)}):
         dataset = stream(root, batch_size=batch_size)
         dataset.set_epoch(3)
         iterator = iter(dataset)

@@ -322,8 +322,7 @@ def test_spawned_workers_yield_the_same_multiset(made, preload):
     dataset = SequenceDataset(made[0], "1d", preload=preload)
     dataset[0]
     expected = loader_multiset(dataset, 0)
-    for workers in (2, 4):
-        assert loader_multiset(dataset, workers, "spawn") == expected
+    assert loader_multiset(dataset, 2, "spawn") == expected
 
 
 def test_batches_three_ways_are_equal(made):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from fuzz_targets import TARGETS
 
-EXAMPLES = 16
+EXAMPLES = 8
 
 
 def run_fuzz(*arguments):
