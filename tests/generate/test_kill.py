@@ -102,16 +102,17 @@ def test_killed_runs_end_with_the_bytes_of_an_unbroken_one(tmp_path):
         f"if __name__ == '__main__':\n    generate(out={str(root)!r}, workers=2, **{SETTINGS!r})\n"
     )
     rng = random.Random(0)
-    kills, finished, listed = {"driver": 0, "worker": 0}, 0, 0
+    kills, finished, listed, turn = {"driver": 0, "worker": 0}, 0, 0, 0
     while sum(kills.values()) < KILLS:
         process = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True)
-        more = rng.randrange(-1, 8)  # finished shards to wait for; -1: not even workers
+        turn += 1
+        more = rng.randrange(-(turn % 2), 8)  # finished shards to wait for; -1: not even workers
         if more >= 0:
             wait_for(process, children, process.pid)
         wait_for_shards(process, root, more)
         if process.poll() is None:
             workers = children(process.pid)
-            if workers and rng.random() < 0.5:
+            if workers and turn % 2 == 0:  # every other time, so that both happen however few there are
                 kills["worker"] += kill(rng.choice(workers))
                 wait_for_shards(process, root, rng.randrange(3))
             kills["driver"] += kill(process.pid)

@@ -332,7 +332,7 @@ def way_between_polygons(sim: Simulator, scale: float = 1.0, cell: float = 0.025
 
 @pytest.mark.slow
 def test_three_worlds_of_val_have_no_way_to_the_goal_or_seem_to():
-    """What docs/environments.md says of the seeds 0 to 199; of those that have a way, every eighth is looked at here."""
+    """What docs/environments.md says of the seeds 0 to 199; here of the others every eighth."""
     sim = Simulator(make_config("navrep-val", physics="original"))
     driven, leapt, seen, true_size = [], [], [], []
     for seed in sorted({15, 167, 198, *range(0, 200, 8)}):
