@@ -1,10 +1,9 @@
 """Examples run as a user would run them."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+import warm_process
 from PIL import Image
 
 from navrep_data.testing import tiny_dataset
@@ -18,7 +17,7 @@ def root(tmp_path_factory):
 
 
 def run(script, *arguments):
-    done = subprocess.run([sys.executable, EXAMPLES / script, *map(str, arguments)], capture_output=True, text=True)
+    done = warm_process.shared().run([EXAMPLES / script, *arguments])
     assert done.returncode == 0, done.stderr
     return done.stdout
 
