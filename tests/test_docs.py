@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 from recorded import AUTHORS
-from warm_process import WarmProcess
+from warm_process import WarmProcess, shared
 
 import navrep_data
 from navrep_data.cli.main import app
@@ -55,9 +55,9 @@ def test_there_are_blocks_of_both_kinds():
     assert {page.stem for page in PAGES if blocks(page)} >= {"README", "tour", "datasets", "robot"}
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def hub():
-    """The Hub that the README's commands talk to: ours, on the loopback (see tests/hub/hub_server.py)."""
+    """The Hub that the pages' commands talk to: ours, on the loopback (see tests/hub/hub_server.py)."""
     sys.path.insert(0, str(ROOT / "tests" / "hub"))
     try:
         import hub_server
@@ -67,44 +67,50 @@ def hub():
         yield {"HF_ENDPOINT": running.url, "HF_TOKEN": hub_server.TOKEN, "HF_HUB_DISABLE_XET": "1"}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=lambda page: page.stem)
-def test_code_blocks_run(page, tmp_path, hub):
-    env = {**hub, "HF_HOME": str(tmp_path / "hf")}
+@pytest.fixture(scope="session")
+def warm(hub, tmp_path_factory):
+    """What runs the commands of all pages."""
+    env = {**hub, "HF_HOME": str(tmp_path_factory.mktemp("hf"))}
     if AUTHORS.is_dir():
         env["NAVREP_RELEASED_DIR"] = str(AUTHORS)
+    with WarmProcess(env) as process:
+        yield process
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=lambda page: page.stem)
+def test_code_blocks_run(page, tmp_path, warm):
     if page.stem not in FROM_SCRATCH:
         tiny_dataset(tmp_path / "data" / "soadrl", n=12, length=200)
     ran = 0
-    with WarmProcess(env) as warm:
-        for kind, code in blocks(page):
-            if ".released" in code and not AUTHORS.is_dir():
-                continue  # the authors' files are not part of the repository
-            named = re.match(r"# (\w+\.py)\n", code)
-            if named:  # a file to save, for the commands that follow
-                (tmp_path / named.group(1)).write_text(code)
-                continue
-            if kind == "python":
-                commands = [["-c", code]]
-            else:
-                commands = [shlex.split(line) for line in lines(code) if not line.startswith(SETUP)]
-                assert all(command[0] == "navrep-data" for command in commands), commands
-                commands = [command[1:] for command in commands]
-            for command in commands:
-                done = warm.run(command, tmp_path)
-                assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
-                ran += 1
+    for kind, code in blocks(page):
+        if ".released" in code and not AUTHORS.is_dir():
+            continue  # the authors' files are not part of the repository
+        named = re.match(r"# (\w+\.py)\n", code)
+        if named:  # a file to save, for the commands that follow
+            (tmp_path / named.group(1)).write_text(code)
+            continue
+        if kind == "python":
+            commands = [["-c", code]]
+        else:
+            commands = [shlex.split(line) for line in lines(code) if not line.startswith(SETUP)]
+            assert all(command[0] == "navrep-data" for command in commands), commands
+            commands = [command[1:] for command in commands]
+        for command in commands:
+            done = warm.run(command, tmp_path)
+            assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+            ran += 1
     assert ran >= 1
 
 
 def test_a_warm_process_says_what_failed(tmp_path):
-    with WarmProcess() as warm:
-        refused = warm.run(["info", "nowhere"], tmp_path)
-        assert (refused.returncode, refused.stdout, len(refused.stderr.splitlines())) == (2, "", 1)
-        wrong = warm.run(["-c", "import os, warnings; print(os.getcwd()); warnings.warn('no')"], tmp_path)
-        assert (wrong.returncode, wrong.stdout) == (1, f"{tmp_path}\n")
-        assert "UserWarning: no" in wrong.stderr
-        assert warm.run(["-c", "import os; os.kill(os.getpid(), 9)"], tmp_path).returncode == -9
+    warm = shared()
+    refused = warm.run(["info", "nowhere"], tmp_path)
+    assert (refused.returncode, refused.stdout, len(refused.stderr.splitlines())) == (2, "", 1)
+    wrong = warm.run(["-c", "import os, warnings; print(os.getcwd()); warnings.warn('no')"], tmp_path)
+    assert (wrong.returncode, wrong.stdout) == (1, f"{tmp_path}\n")
+    assert "UserWarning: no" in wrong.stderr
+    assert warm.run(["-c", "import os; os.kill(os.getpid(), 9)"], tmp_path).returncode == -9
 
 
 def commands_named():

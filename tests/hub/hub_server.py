@@ -32,8 +32,8 @@ class Fault:
 
     method and path (a pattern searched in the path) choose requests, times how many of them, after how many to leave
     alone. kind: "status" answers `status` with `headers`; "cut" ends the connection after `at` body bytes (of the
-    answer, or of the upload); "flip" changes a byte of the answer's body; "stall" is silent for `seconds`; "call" runs
-    `action(hub)` before the request is served.
+    answer, or of the upload); "flip" changes a byte of the answer's body; "stall" is silent for `seconds` or until
+    `over` is set, and then cuts the connection; "call" runs `action(hub)` before the request is served.
     """
 
     kind: str
@@ -46,6 +46,7 @@ class Fault:
     at: int = 0
     seconds: float = 0.0
     action: Any = None
+    over: threading.Event = field(default_factory=threading.Event, init=False)
 
     def fits(self, method: str, path: str) -> bool:
         return self.method in ("", method) and re.search(self.path, path) is not None
@@ -83,7 +84,6 @@ class LoopbackHub:
     # every answer of file content ends its connection after this many bytes
     cut_every: int | None = None
     leaked: list[str] = field(default_factory=list)
-    stop: threading.Event = field(default_factory=threading.Event)
     lock: threading.RLock = field(default_factory=threading.RLock)
     url: str = ""
     cdn: str = ""
@@ -146,7 +146,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.fault is not None and self.fault.kind == "call":
             self.fault.action(hub)
         if self.fault is not None and self.fault.kind == "stall":
-            hub.stop.wait(self.fault.seconds)
+            self.fault.over.wait(self.fault.seconds)
             self.close_connection = True
             return
         if self.fault is not None and self.fault.kind == "cut" and method in ("PUT", "POST"):
@@ -396,7 +396,8 @@ def serving(hub: LoopbackHub | None = None, port: int = 0) -> Iterator[LoopbackH
     try:
         yield hub
     finally:
-        hub.stop.set()
+        for fault in hub.faults:
+            fault.over.set()
         server.shutdown()
         server.server_close()
         thread.join(timeout=5)

@@ -1,6 +1,7 @@
 """Datasets opened on the Hub: whole in the cache, or streamed through a bounded one."""
 
 import contextlib
+import dataclasses
 import os
 import pickle
 import time
@@ -130,7 +131,7 @@ def test_a_revision_is_what_it_was(hub, pushed, template, revision):
     ids=lambda f: f.kind,
 )
 def test_opening_goes_on_after_a_failure(hub, pushed, template, cls, fault):
-    hub.faults = [Fault(**fault.__dict__)]
+    hub.faults = [dataclasses.replace(fault)]
     options = {"window": 8, "fields": ["sequence", "step"]}
     there = cls.from_hub(REPO, "1d", **options)
     assert windows(there) == windows(SequenceDataset(template, "1d", **options))
