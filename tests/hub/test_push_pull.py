@@ -665,6 +665,7 @@ def command(hub, tmp_path, warm):
         **os.environ, "HF_ENDPOINT": hub.url, "HF_TOKEN": TOKEN, "HF_HUB_DISABLE_XET": "1",
         "HF_HOME": str(tmp_path / "hf-home"), "MPLCONFIGDIR": str(tmp_path),
     }  # fmt: skip
+    del environment["NAVREP_DATA_HOME"]  # a home without kernels: each command would compile what it calls
 
     def start(*words, wait=True, pictures=False):
         """Return a command that runs, or with `wait` its exit status and what it said."""
