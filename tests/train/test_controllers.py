@@ -32,6 +32,12 @@ from navrep_data.zoo.sb3 import put_weights
 SMALL = {"worlds": 8, "rollout": 8, "batch": 32, "steps": 128, "validate_every": 64}
 
 
+def small(features, **changes):
+    """Return a recipe of few steps; end to end in float32, as bfloat16 is slow on processors that do not have it."""
+    precision = {"precision": "float32"} if features == "e2e" else {}
+    return default_controller_recipe(features, "1d").replace(**{**SMALL, **precision, **changes})
+
+
 def world_model(lidar="1d", alignment="taken"):
     torch.manual_seed(0)
     settings = {"lidar": lidar, "z_size": 16, "n_blocks": 1, "n_heads": 2, "action_alignment": alignment}
@@ -326,7 +332,7 @@ def test_ppo_moves_actor_critic_and_width_and_nothing_of_the_encoder(features, f
     """End to end it moves the convolutions, too."""
     model = None if features == "e2e" else world_model()
     before = {} if model is None else {name: p.clone() for name, p in model.named_parameters()}
-    recipe = default_controller_recipe(features, "1d").replace(**{**SMALL, "steps": 64})
+    recipe = small(features, steps=64)
     controllers.train_controller(recipe, tmp_path / "a", model=model, stop_after=64)
     first = checkpoint.load(tmp_path / "a" / "checkpoints" / "step-00000064")
     controllers.train_controller(recipe.replace(lr=1e-9), tmp_path / "b", model=model, stop_after=64)
@@ -358,8 +364,7 @@ def test_resume_goes_on_and_refuses_other_settings(few_episodes, tmp_path):
 def test_a_resume_gives_the_same_weights(features, few_episodes, tmp_path):
     model = None if features == "e2e" else world_model()
     # 24 steps per world between checkpoints: episodes are cut there, and some end and adapt their difficulty
-    recipe = default_controller_recipe(features, "1d").replace(**{**SMALL, "rollout": 24, "steps": 576, "batch": 64,
-                                                                  "validate_every": 192})  # fmt: skip
+    recipe = small(features, rollout=24, steps=576, batch=64, validate_every=192)
     controllers.train_controller(recipe, tmp_path / "whole", model=model)
     controllers.train_controller(recipe, tmp_path / "parts", model=model, stop_after=192)
     controllers.train_controller(recipe, tmp_path / "parts", model=model, resume=True, stop_after=384)
