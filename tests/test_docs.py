@@ -103,6 +103,7 @@ def test_code_blocks_run(page, tmp_path, warm):
     assert ran >= 1
 
 
+@pytest.mark.slow
 def test_a_warm_process_says_what_failed(tmp_path):
     warm = shared()
     refused = warm.run(["info", "nowhere"], tmp_path)

@@ -311,6 +311,7 @@ def test_flags_that_do_not_fit(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_ray_is_imported_only_where_it_is_used():
     code = "import sys, navrep_data.cli.main, navrep_data.generate; sys.exit('ray' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -52,6 +52,7 @@ def test_redraw_prints_the_table(played):
     assert "report.md" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

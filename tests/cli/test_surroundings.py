@@ -146,6 +146,7 @@ def test_output_on_a_full_disk(dataset):
     check_one_line(code, err, "standard output: No space left")
 
 
+@pytest.mark.slow
 def test_a_terminal_without_the_characters(tmp_path):
     latin = {"PYTHONIOENCODING": "latin-1"}
     code, _, err = navrep("info", "карта", cwd=tmp_path, env=latin)
@@ -171,6 +172,7 @@ def test_a_working_folder_that_was_deleted(tmp_path, monkeypatch, capsys):
     check_one_line(code, err, "The working folder does not exist any more")
 
 
+@pytest.mark.slow
 def test_a_reader_that_has_gone_is_no_error(dataset):
     process = subprocess.Popen(
         [sys.executable, "-m", "navrep_data", "info", dataset], stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -201,6 +203,7 @@ def verbs(command=None, words=()):
     return [found for name, one in below.items() for found in verbs(one, (*words, name))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", verbs(), ids=" ".join)
 def test_every_verb_says_once_that_it_was_interrupted(words, monkeypatch, capsys):
     command = typer.main.get_command(cli.app)

@@ -25,6 +25,7 @@ def run(capsys):
     return call
 
 
+@pytest.mark.slow
 def test_filter_merge_and_verify(run, dataset, tmp_path):
     code, out, err = run("filter", dataset, "--outcome", "goal", "--out", tmp_path / "goals")
     assert (code, err) == (0, "")
@@ -60,6 +61,7 @@ def test_split(run, dataset, tmp_path):
     assert "seed 4" in Manifest.read(tmp_path / "t" / "val").split_rule
 
 
+@pytest.mark.slow
 def test_stats_and_sample(run, dataset, tmp_path):
     code, out, _ = run("stats", dataset, "--split", "val")
     lines = out.splitlines()
@@ -72,6 +74,7 @@ def test_stats_and_sample(run, dataset, tmp_path):
     assert out.splitlines() == [str(p) for p in (tmp_path / "p").iterdir()]
 
 
+@pytest.mark.slow
 def test_export(run, dataset, tmp_path):
     code, out, _ = run("export", dataset, "--format", "npz", "--out", tmp_path / "npz", "--json")
     assert code == 0
@@ -82,6 +85,7 @@ def test_export(run, dataset, tmp_path):
     assert "minari.load_dataset('me/crowd-v2')" in out.splitlines()[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

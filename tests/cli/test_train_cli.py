@@ -58,6 +58,7 @@ def test_v_codes_m_and_their_error(dataset, tmp_path, capsys):
     assert figure.is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

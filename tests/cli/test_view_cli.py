@@ -28,6 +28,7 @@ def run(capsys, *arguments):
     return ended.value.code, out, err
 
 
+@pytest.mark.slow
 def test_it_writes_a_page_and_prints_where(dataset, tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "navrep_data", "view", str(dataset)],

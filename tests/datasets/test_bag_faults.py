@@ -134,6 +134,7 @@ def test_blind_sectors_are_said_once_and_declared(tmp_path):
 # --- odometry
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [0.9, 2.0, 16384.0, 1e-9, 1e200])
 def test_quaternions_of_any_length(tmp_path, length):
     with Recorder(tmp_path / "bag", "ros1") as bag:
@@ -265,6 +266,7 @@ def test_definitions_of_topics_that_are_not_used_do_not_matter(tmp_path, kind, t
 # --- what was cut off
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS[1:])
 def test_folders_without_metadata(tmp_path, kind):
     path = record(tmp_path / "bag", kind, seconds=2.0)

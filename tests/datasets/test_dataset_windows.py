@@ -34,6 +34,7 @@ def rows_of(contents, sequence, column, first, count):
     return contents[sequence][column][first : first + count]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [1, 7, 32, 200])
 @pytest.mark.parametrize("stride", [None, 1, 5, 64])
 def test_the_index_is_the_oracles(made, window, stride):
@@ -53,6 +54,7 @@ def contents_row(contents, info):
     return np.flatnonzero((columns["episode"] == info["episode"]) & (columns["step"] == info["step"]))[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preload", [False, True])
 @pytest.mark.parametrize("lidar", ["rings", "1d"])
 def test_default_fields_hold_the_rows_and_zeros_past_the_episode(made, lidar, preload):
@@ -99,6 +101,7 @@ def test_rings_are_computed_where_the_dataset_has_none(made, tmp_path):
         assert torch.equal(a["next_rings"], b["next_rings"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scan_dtype", ["uint16", "float32"])
 def test_scan_units_and_invalid_rays(tmp_path, scan_dtype):
     contents = write_dataset(tmp_path / "d", [[10]], scan_dtype=scan_dtype)
@@ -119,6 +122,7 @@ def test_scan_units_and_invalid_rays(tmp_path, scan_dtype):
         assert not got[10:].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preload", [False, True])
 @pytest.mark.parametrize("stride", [32, 3])
 def test_targets_are_the_next_row_of_the_same_episode(made, stride, preload):

@@ -212,6 +212,7 @@ def test_nothing_is_overwritten_and_failures_leave_nothing(tmp_path):
         import_npz(source, out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.int64, np.uint8])
 def test_files_of_the_originals_tool_for_bags(tmp_path, dtype):
     """float64 scans, whole numbers as dones, goals unknown; inf hit nothing, NaN saw nothing. As a folder in a list."""

@@ -223,6 +223,7 @@ def second_goal(bag):
     bag.goal(0.5, 5.0, 0.0, topic="/other_goal")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("edit", "settings", "error", "words"),
     [
@@ -257,6 +258,7 @@ def test_what_is_refused(tmp_path, edit, settings, error, words):
     assert [p.name for p in tmp_path.iterdir()] == ["bag.bag"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("edit", "settings"),
     [

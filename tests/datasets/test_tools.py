@@ -172,6 +172,7 @@ def slow_runs(root, fits):
     return runs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("conditions", "fits"),
     [
@@ -208,6 +209,7 @@ def test_crowds_are_known_without_the_humans_column(tmp_path):
     assert [s[:3] for s in sources(tmp_path / "a")] == [s[:3] for s in sources(tmp_path / "b")]
 
 
+@pytest.mark.slow
 def test_no_sequence_leaks_through_a_chain_of_tools(few, many, tmp_path):
     """Filter, merge, filter: rows are named by where they were generated, and stay on one side."""
     filter(few, tmp_path / "goals", outcomes=["goal"])
@@ -247,6 +249,7 @@ def test_one_sequence_on_two_sides_is_refused(few, tmp_path):
         merge([tmp_path / "s" / "test", tmp_path / "rest"], tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_split_keeps_the_splits(few, tmp_path):
     made = split(few, tmp_path / "out")
     assert sorted(made) == ["test", "train", "val"]
@@ -261,6 +264,7 @@ def test_split_keeps_the_splits(few, tmp_path):
     assert Manifest.read(tmp_path / "again").rows == Manifest.read(few).rows
 
 
+@pytest.mark.slow
 def test_split_by_shares_keeps_what_came_from_one_sequence_together(few, many, tmp_path):
     merge([few, many], tmp_path / "both")
     filter(tmp_path / "both", tmp_path / "cut", min_steps=40)
@@ -302,6 +306,7 @@ def test_too_few_sequences_to_split(few, tmp_path):
         split(tmp_path / "one" / "val", tmp_path / "out", shares={"train": 0.6, "val": 0.2, "test": 0.2})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tool", ["merge", "split", "filter"])
 def test_a_failure_leaves_everything_as_it_was(few, many, tmp_path, monkeypatch, tool):
     shutil.copytree(few, tmp_path / "few")
@@ -458,6 +463,7 @@ def test_what_generate_writes_has_never_heard_of_sources(few):
     assert all("source" not in shard for shard in values["shards"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
@@ -522,6 +528,7 @@ def test_stats(few):
         stats(few, split="vall")
 
 
+@pytest.mark.slow
 def test_sample(few, tmp_path):
     paths = sample(few, tmp_path / "a", n=2, seed=5)
     assert len(paths) == len(set(paths)) == 2

@@ -107,6 +107,7 @@ def test_names_sort_like_sequences(tmp_path, monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_minari(generated, tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     seen = []
@@ -144,6 +145,7 @@ def test_minari(generated, tmp_path, monkeypatch):
     }
 
 
+@pytest.mark.slow
 def test_minari_has_no_place_for_episodes_without_an_action(tmp_path):
     pytest.importorskip("minari")
     import_npz(write(tmp_path / "in", sequence()), tmp_path / "d")

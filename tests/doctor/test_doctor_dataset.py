@@ -101,6 +101,7 @@ def test_doubled_rows_in_one_split_are_a_note(sound, tmp_path):
     assert {f.check for f in report.findings} == {"duplicates"}
 
 
+@pytest.mark.slow
 def test_frozen_and_dead_lidars(sound, tmp_path):
     def freeze(k, columns, worlds):
         columns["scan"][:] = columns["scan"][0]
@@ -120,6 +121,7 @@ def test_frozen_and_dead_lidars(sound, tmp_path):
     ] * 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("declared", "left"), [([[100, 119]], None), ([[90, 109], [3, 4]], 10), ("rubbish", 20)])
 def test_sectors_that_are_declared_blind(sound, tmp_path, declared, left):
     def kill(k, columns, worlds):
@@ -131,6 +133,7 @@ def test_sectors_that_are_declared_blind(sound, tmp_path, declared, left):
     assert [what.split(" rays")[0] for what in found] == ([] if left is None else [f"{left} of 1080"] * 3)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_cannot_be(sound, tmp_path):
     from dataclasses import replace
 
@@ -253,6 +256,7 @@ def run(capsys, *arguments):
     return ended.value.code, out, err
 
 
+@pytest.mark.slow
 def test_the_command(sound, tmp_path, capsys):
     code, out, _ = run(capsys, "doctor", sound)
     assert code == 0

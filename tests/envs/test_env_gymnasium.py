@@ -94,6 +94,7 @@ def test_wrappers_that_show(name, tmp_path):
     wrapped.close()
 
 
+@pytest.mark.slow
 def test_infos_are_numbers_that_arrays_of_other_libraries_can_be_made_of():
     """Strings and objects have no place in torch or jax; final_obs alone is an object array, as gymnasium has it."""
     names = ["navrep-test", "crowdmove-1", "ian"] if HAS_MAPS else ["navrep-test"]
@@ -106,6 +107,7 @@ def test_infos_are_numbers_that_arrays_of_other_libraries_can_be_made_of():
                 np.from_dlpack(value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env", "physics"), CASES)
 def test_the_spec_says_how_long_an_episode_can_be(env, physics):
     """A robot that stands still, alone, is stopped by the time limit in that step and in no other."""

@@ -9,6 +9,7 @@ from navrep_data.errors import ConfigError
 from navrep_data.sim import Simulator, make_config
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("env", ["navrep-test", "navrep-train", param("mark-test-2")])
 def test_the_robot_starts_there_and_wants_to_go_there(env, physics):
@@ -59,6 +60,7 @@ def test_worlds_of_a_batch_have_one_place_or_one_each():
     assert abs(infos["robot"][1, 0] - 1.0) > 0.1  # the next episode starts where it is drawn
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", [param("mark-test-2")])
 def test_planners_follow_a_new_goal_on_maps(env):
     sim = Simulator(make_config(env), 2, seed=3)

@@ -97,6 +97,7 @@ def test_small_maps_are_shown_whole_and_large_ones_in_part(tmp_path, side, whole
     assert (np.abs(everybody - [camera.x, camera.y]) <= camera.half).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(12.0, 12.0), (30.0, 20.0), (60.0, 10.0), (45.0, 45.0)])
 def test_walls_at_the_border_of_own_maps_are_whole_or_out_of_sight_and_the_robot_is_in_sight(tmp_path, width, height):
     """The pictures of whole episodes, wherever the robot drives: where a picture ends there is no wall."""

@@ -127,6 +127,7 @@ def test_attributes_and_methods_are_those_of_each_world():
     worlds.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lidar", "flat", "policy"),
     [(None, True, "MlpPolicy"), ("1d", True, "MlpPolicy"), ("rings", False, "MultiInputPolicy")],

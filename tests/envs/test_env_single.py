@@ -221,6 +221,7 @@ def test_str_names_environment_and_physics():
     assert len(ENVIRONMENTS) == len(set(ENVIRONMENTS))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not HAS_MAPS, reason="needs the maps: pip install 'navrep-data[maps]'")
 def test_ian_plays_the_suites_episodes_by_number_and_numpy_seeds_by_seed():
     sim = Simulator(make_config("ian", physics="original"))

@@ -21,6 +21,7 @@ def actions_of(rng, env):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env", "physics"), CASES)
 @pytest.mark.parametrize("n", [1, 4])
 def test_equals_single_stepping_bit_for_bit(env, physics, n):
@@ -88,6 +89,7 @@ def test_infos_are_those_of_gymnasiums_own_vector_environment(env, mode):
     assert ends > 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", ["navrep-train", "navrep-test", param("ian")])
 def test_episodes_are_the_same_in_every_autoreset_mode(env):
     modes = ["SameStep", "NextStep", "Disabled"]
@@ -163,6 +165,7 @@ def test_numbered_episodes_are_shared_out_and_wrap():
     assert env.reset(options={"episode": 498})[1]["seed"].tolist() == [1498, 1499, 1000]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env", "physics"), CASES)
 def test_same_seed_same_episodes_whatever_the_batch(env, physics):
     few, many = make_vec(env, 2, physics=physics), make_vec(env, 5, physics=physics)

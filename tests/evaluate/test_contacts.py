@@ -205,6 +205,7 @@ def test_the_ratio_is_of_sums_and_unknown_over_nothing():
     assert all(math.isnan(v) for v in bootstrap_ratio([0.0], [0.0]))
 
 
+@pytest.mark.slow
 def test_later_rounds_are_the_same_episodes_in_a_place_of_their_own(tmp_path):
     whole = benchmark(["goal"], episodes=8, out=tmp_path, figures=False)
     later = benchmark(["goal"], episodes=3, first_round=5, out=tmp_path, figures=False)

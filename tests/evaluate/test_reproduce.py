@@ -181,6 +181,7 @@ def world_model(folder, name, lidar, split="train", data="d", scan=0.01):
     save(result, folder, {"name": "soadrl", "content_hash": data}, {})
 
 
+@pytest.mark.slow
 def test_world_models_are_compared_on_the_same_rows_only(tmp_path):
     world_model(tmp_path, "transformer_1d.released", "1d")
     world_model(tmp_path, "joint_1d.released", "1d", scan=0.5)
@@ -260,6 +261,7 @@ def test_the_table_is_what_its_suffix_says(measured):
     assert rows["e2e_1d", "released"]["runs"].split("; ") == ["e2e_1d.20201026", "e2e_1d.20201027"]
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_for_papers_too(tmp_path):
     (tmp_path / "a_z").mkdir()
     (tmp_path / "a_z" / "log.csv").write_text("step,success,val_success\n100,,0.1\n200,,0.2\n")

@@ -41,6 +41,7 @@ def same(a, b):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["goal", "random", "orca", "dwa"])
 def test_episodes_do_not_depend_on_the_batch_or_on_who_is_played_beside_them(policy):
     one = played(policy, range(9), batch=1)
@@ -232,6 +233,7 @@ def test_refusals(tmp_path, arguments, error, words):
         benchmark(out=tmp_path, figures=False, **arguments)
 
 
+@pytest.mark.slow
 def test_a_callable_can_be_passed(tmp_path):
     def forward(scan, robot_state):
         return np.tile([1.0, 0.0], (len(scan), 1))
@@ -240,6 +242,7 @@ def test_a_callable_can_be_passed(tmp_path):
     assert report.rows[0]["name"].endswith("forward")
 
 
+@pytest.mark.slow
 def test_a_policy_is_named_by_its_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     asked = {"suite": "navreptest", "episodes": 3, "figures": False}

@@ -79,6 +79,7 @@ def test_lists_show_the_main_result_alone(entries):
     assert _score([later], "navreptest") == "-"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [NAME, "e2e_1d.v1"])
 def test_no_two_rows_or_lines_of_a_card_say_the_same(entries, name, monkeypatch):
     from dataclasses import replace

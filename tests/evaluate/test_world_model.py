@@ -62,6 +62,7 @@ def by_rows(model, data, split, steps):
     return np.mean(scan), np.mean(goal), [np.mean(d) for d in dreamed], [len(d) for d in dreamed], len(scan)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["transformer", "joint", "modular"])
 def test_error_is_that_of_single_rows(kind, dataset):
     model = make(kind)

@@ -145,6 +145,7 @@ def test_codes_whose_splits_are_no_object(files):
     refused(lambda: target.read(files), CorruptDataError, "lacks or garbles a field")
 
 
+@pytest.mark.slow
 @of("training")
 @pytest.mark.parametrize("text", ["[]", "{}", '{"last": "step-/../.."}', '{"last": "step-00000099"}'])
 def test_a_training_that_names_no_checkpoint(files, text):
@@ -187,6 +188,7 @@ def test_versions_of_several_lines(tmp_path, name, file):
     refused(lambda: target.read(tmp_path), NavrepDataError, "has format version '1")
 
 
+@pytest.mark.slow
 @of("policy")
 @pytest.mark.parametrize("key", ["features", "lidar", "context"])
 def test_a_policy_that_does_not_say_what_it_sees(files, key):
@@ -369,6 +371,7 @@ def bomb(path, name, **options):
         made.id.write_direct_chunk((0,) * values.ndim, zlib.compress(bytes(128 << 20), 1))
 
 
+@pytest.mark.slow
 def test_chunks_that_inflate_without_end(shard):
     bomb(shard, "scan", fletcher32=True)
     refused(lambda: Shard(shard).read("scan", 0, 1), CorruptDataError, "does not inflate to the expected")

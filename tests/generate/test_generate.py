@@ -368,6 +368,7 @@ def test_a_newer_format_is_not_touched(reference, tmp_path):
     assert tree(root) == before
 
 
+@pytest.mark.slow
 def test_python_policies_do_not_depend_on_how_many_sequences_there_are(tmp_path):
     def network(scan, robot_state):
         weights = np.random.default_rng(0).normal(size=(1085, 2)).astype(np.float32)

@@ -46,6 +46,7 @@ def shard_bytes(template):
     return [s.bytes for s in Manifest.read(template).shards]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cls", [SequenceDataset, ScanDataset])
 def test_from_hub_is_the_dataset(hub, pushed, template, cls):
     options = {"window": 8} if cls is SequenceDataset else {}
@@ -116,6 +117,7 @@ def test_a_revision_is_what_it_was(hub, pushed, template, revision):
         SequenceDataset.from_hub(REPO, "1d", revision=revision, window=8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cls", few([StreamingSequenceDataset, SequenceDataset], 1))
 @pytest.mark.parametrize(
     "fault",

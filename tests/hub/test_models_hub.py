@@ -70,6 +70,7 @@ def world_model():
 # ---- folders ----
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("features", few(["z", "h", "zh"], 1))
 def test_a_policy_folder(tmp_path, features, monkeypatch):
     policy = a_policy(features)
@@ -144,6 +145,7 @@ def test_a_policy_that_is_none(tmp_path, change, words):
 # ---- the Hub ----
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
 def test_a_world_model_goes_up_and_comes_down(hub, template, tmp_path):
     push(template, "user/crowd", license="mit")

@@ -73,6 +73,7 @@ def check_whole(root, template):
 # ---- without failures ----
 
 
+@pytest.mark.slow
 def test_what_tools_made_goes_up_and_comes_down_in_parts(hub, template, tmp_path, monkeypatch):
     monkeypatch.setattr(_pieces, "TARGET_SHARD_ROWS", 80)
     filter(template, tmp_path / "made", outcomes=["goal", "timeout", "stuck", "cut"])
@@ -110,6 +111,7 @@ def test_there_and_back(hub, template, tmp_path):
     assert b"license: cc-by-4.0" in there["README.md"]
 
 
+@pytest.mark.slow
 def test_what_was_pulled_goes_up_again_as_it_is(hub, pushed, tmp_path):
     got = pull(REPO, tmp_path / "got")
     again = push(got.root, "user/copy")
@@ -152,6 +154,7 @@ def test_branches_tags_and_commits(hub, template, tmp_path):
     assert not (tmp_path / "c").exists()
 
 
+@pytest.mark.slow
 def test_a_private_repository(hub, template, tmp_path, monkeypatch):
     push(template, REPO, license="mit", private=True)
     assert hub.repo(REPO).private
@@ -185,6 +188,7 @@ def test_parts_add_up(hub, pushed, template, tmp_path):
     assert hub.count(LARGE, "GET") == 6  # each file once
 
 
+@pytest.mark.slow
 def test_a_part_is_no_dataset_to_push(hub, pushed, tmp_path):
     root = pull(REPO, tmp_path / "got", shards=[0]).root
     with pytest.raises(DatasetError, match="is a part of a dataset, expected a complete one"):
@@ -207,6 +211,7 @@ def test_parse_shards_refuses(text):
 # ---- folders ----
 
 
+@pytest.mark.slow
 def test_a_folder_with_something_else_is_left_alone(hub, pushed, template, tmp_path):
     mine = tmp_path / "mine"
     mine.mkdir()
@@ -224,6 +229,7 @@ def test_a_folder_with_something_else_is_left_alone(hub, pushed, template, tmp_p
         pull(REPO, got)
 
 
+@pytest.mark.slow
 def test_a_version_that_grew_is_added_and_one_that_changed_is_refused(hub, tmp_path):
     make_dataset(tmp_path / "v1", 4, 2, 40)
     make_dataset(tmp_path / "v2", 6, 2, 40)
@@ -243,6 +249,7 @@ def test_a_version_that_grew_is_added_and_one_that_changed_is_refused(hub, tmp_p
     assert verify(tmp_path / "got").problems == []
 
 
+@pytest.mark.slow
 def test_a_damaged_copy_is_mended(hub, pushed, template, tmp_path):
     root = pull(REPO, tmp_path / "got").root
     path = root / "data" / "shard-00001.h5"
@@ -308,6 +315,7 @@ def test_revisions_are_checked(hub, tmp_path):
 # ---- failures on the way down ----
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [4099, 1 << 16, pytest.param(1031, marks=pytest.mark.slow)])
 def test_connections_cut_every_k_bytes(hub, pushed, template, tmp_path, every):
     hub.cut_every = every
@@ -351,6 +359,7 @@ def test_a_file_that_stays_wrong_never_counts(hub, pushed, template, tmp_path):
     check_whole(root, template)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", few([r"/api/datasets", LARGE, r"/tree/", r"/resolve/", "manifest.json"], 2))
 @pytest.mark.parametrize(
     "status", [429, pytest.param(500, marks=pytest.mark.slow), pytest.param(503, marks=pytest.mark.slow)]
@@ -430,6 +439,7 @@ def test_refusals_are_one_line(hub, pushed, tmp_path, status, words):
     assert hub.count("") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "status", "code", "words"),
     few(

@@ -59,6 +59,7 @@ def test_the_models_own_scan_passes_through_unchanged():
     assert np.array_equal(out, scan)
 
 
+@pytest.mark.slow
 def test_the_kernel_alone_keeps_the_models_own_scan_to_rounding():
     adapter = ScanAdapter(Lidar.of(CONTRACT))
     adapter._same = False

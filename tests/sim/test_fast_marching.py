@@ -92,6 +92,7 @@ def test_a_closed_goal_starts_all_the_same():
     assert np.isfinite(solve(speeds, (2, 2))).sum() == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("uniform", [False, True])
 def test_paths_follow_the_originals_rules(seed, uniform):

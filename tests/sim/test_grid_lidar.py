@@ -67,6 +67,7 @@ def random_solid(rng):
     return rng.random(shape) < rng.choice([0.02, 0.1, 0.4])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4 if PURE_PYTHON else 60))
 def test_random_maps_match_every_square_tried_one_by_one(seed):
     # the sensor is in a solid cell in some, outside the map in about half of these

@@ -64,6 +64,7 @@ def test_swept_distance_equals_dense_sampling(share: float) -> None:
                     assert reach - 1e-9 <= seen <= wanted + 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("original", [0.0, 1.0])
 def test_a_wall_touched_together_with_somebody_is_noted_where_the_robot_got_to(original):
     """The other puts the robot back, so that the wall does no damage; it was touched all the same."""

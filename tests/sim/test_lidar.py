@@ -68,6 +68,7 @@ def random_world(rng, boxes=8, circles=12):
     return [*polygons, BORDER], discs, np.array([*rng.uniform(-8, 8, 2), rng.uniform(-7, 7)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS)
 def test_random_worlds_match_brute_force(name):
     # Boxes overlap, the sensor is inside one in about a third of the worlds and inside a circle in some.

@@ -44,6 +44,7 @@ def farthest(points, polygons):
     return best.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_exact_outlines_enclose_the_solid_cells(seed):
     solid = np.random.default_rng(seed).random((25, 19)) < 0.4 if seed % 2 else blobs(seed)

@@ -173,6 +173,7 @@ def test_the_optional_packages_modules_are_not_imported(paper_maps):
 # --- maps of one's own --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_cells_places_and_occupancies(tmp_path):
     grid = load_map(write_map(tmp_path))
     assert (grid.name, grid.source, grid.shape) == ("map", "map.yaml", (6, 4))
@@ -256,6 +257,7 @@ HOSTILE_YAML = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", sorted(HOSTILE_YAML))
 def test_hostile_yaml_is_refused(case, tmp_path):
     changes, words = HOSTILE_YAML[case]

@@ -363,6 +363,7 @@ def test_too_small_capacity_says_so():
     assert build_obstacles(vertices, start[:1], *make_obstacles(n)) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extra", [0, -1])
 def test_an_agent_sees_its_rows_and_the_extra_one(extra):
     rng = np.random.default_rng(19)

@@ -53,6 +53,7 @@ def path(tmp_path: Path) -> str:
     return write_map(tmp_path / "hall", hall())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["planned", "orca", "constant-velocity", "static"])
 def test_humans_start_free_and_stay_out_of_walls(path: str, policy: str) -> None:
     simulator = Simulator(make_config("map", maps=(path,), humans=4, human_policy=policy), 4, seed=2)

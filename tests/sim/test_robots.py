@@ -87,6 +87,7 @@ def test_every_robot_moves_by_its_own_command():
     np.testing.assert_allclose(states[1, 0], np.cos(-0.04) * 50 + np.sin(-0.04) * -0.1, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_robots_see_each_other_and_not_themselves():
     sim = three()
     sim.arrays.agents[0, 1, lay.A_HEADING] = np.pi / 2

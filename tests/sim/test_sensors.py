@@ -308,6 +308,7 @@ def test_noise_of_a_numbered_episode_is_that_of_its_number():
     assert (b.observe()[0][0] != b.observe()[0][1]).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_invalid_rays_are_stored_as_0():
     config = make_config("soadrl", humans=4, scan_noise=2.0, scan_dropout=0.3)
     mm, _ = ScriptedRollout(config, RolloutSettings(length=40), ScriptedPolicy(), 0).run([0])[0]

@@ -64,6 +64,7 @@ def play(sim, actions):
     return seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", range(CASES))
 def test_a_batch_is_made_of_single_worlds(case):
     rng = np.random.default_rng(case)

@@ -114,6 +114,7 @@ def test_progress_is_paid_on_steps_that_end_nothing():
     assert ends > 0
 
 
+@pytest.mark.slow
 def test_groups_of_worlds_are_the_worlds_of_one_batch():
     """Same streams, same codes, same rewards, however many threads step them."""
     model = world_model()
@@ -155,6 +156,7 @@ def test_groups_of_worlds_are_the_worlds_of_one_batch():
     parts.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("easy", "expected"), [(True, [0, 0]), (False, [5, 10])])
 def test_worlds_start_easy_or_hard(easy, expected, few_episodes, tmp_path):
     recipe = default_controller_recipe("z", "1d").replace(**SMALL, easy_start=easy)
@@ -192,6 +194,7 @@ def test_the_width_of_actions_stays_within_its_bounds(least, few_episodes, tmp_p
         recipe.replace(least_std=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [False, True])
 def test_timeouts_are_truncations_unless_they_end(end):
     recipe = default_controller_recipe("z", "1d").replace(**SMALL, timeouts_end=end)
@@ -229,6 +232,7 @@ def test_speed_limit_in_numpy_and_torch_agree():
     np.testing.assert_array_equal(shorten(actions, 0.0), clipped.numpy())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lidar", ["rings", "1d"])
 def test_scans_are_encoded_in_8_bits_while_training_and_exactly_afterwards(lidar, monkeypatch):
     model = world_model(lidar)
@@ -253,6 +257,7 @@ def test_scans_are_encoded_in_8_bits_while_training_and_exactly_afterwards(lidar
     assert 0.0 < np.abs(rounded - codes).max() < 0.1 * codes[:, :-5].std()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("features", ["z", "zh"])
 def test_a_few_steps_leave_a_policy_that_loads_and_drives(features, few_episodes, tmp_path):
     model = world_model()
@@ -279,6 +284,7 @@ def test_a_few_steps_leave_a_policy_that_loads_and_drives(features, few_episodes
     )
 
 
+@pytest.mark.slow
 def test_a_goal_with_a_contact_is_no_success_of_ours(few_episodes, tmp_path, monkeypatch):
     """In original physics a goal outranks a collision of the same step; checkpoints are not chosen by such goals."""
     said = iter([[(Event.GOAL, True)] * 3, [(Event.GOAL, False), (Event.TIMEOUT, False), (Event.TIMEOUT, True)]])
@@ -447,6 +453,7 @@ def test_settings_have_limits(name, value):
         default_controller_recipe("z", "1d").replace(**{name: value})
 
 
+@pytest.mark.slow
 def test_end_to_end(few_episodes, tmp_path):
     recipe = default_controller_recipe("e2e", "1d").replace(**{**SMALL, "steps": 64})
     controllers.train_controller(recipe, tmp_path / "c")
@@ -482,6 +489,7 @@ def test_a_network_is_continued(few_episodes, tmp_path):
         controllers.train_controller(recipe.replace(features="zh"), tmp_path / "d", model=model, init=init)
 
 
+@pytest.mark.slow
 def test_a_resume_need_not_name_what_it_went_on_from(few_episodes, tmp_path):
     model = world_model()
     init = Policy(Controller(ControllerConfig(21, n_hidden=24)), "z", "1d", None, model, name="given")
@@ -492,6 +500,7 @@ def test_a_resume_need_not_name_what_it_went_on_from(few_episodes, tmp_path):
     assert checkpoint.load(tmp_path / "c").config.n_hidden == 24
 
 
+@pytest.mark.slow
 def test_a_refused_training_leaves_the_folder_free(few_episodes, tmp_path):
     model = world_model()
     recipe = default_controller_recipe("z", "1d").replace(**{**SMALL, "steps": 32, "rollout": 4})
@@ -500,6 +509,7 @@ def test_a_refused_training_leaves_the_folder_free(few_episodes, tmp_path):
     assert controllers.train_controller(recipe, tmp_path / "c", model=model).steps == 32
 
 
+@pytest.mark.slow
 def test_a_resume_repairs_what_a_stopped_run_left_half_done(few_episodes, tmp_path):
     model, out = world_model(), tmp_path / "c"
     recipe = default_controller_recipe("z", "1d").replace(**{**SMALL, "steps": 32, "rollout": 4})

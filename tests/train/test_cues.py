@@ -59,6 +59,7 @@ def test_the_authors_ask_for_nothing():
     assert not cues.wanted(default_recipe("m", "rings"))
 
 
+@pytest.mark.slow
 def test_asking_teaches_z_to_tell():
     """On one batch, over and over: both errors fall, and the gradient goes through z into V."""
     torch.manual_seed(0)
@@ -98,6 +99,7 @@ def test_world_models_are_asked_too(dataset, tmp_path):
     assert "cue_people" not in train_world_model(mute, dataset, tmp_path / "mute", preload=False).validation
 
 
+@pytest.mark.slow
 def test_a_resume_keeps_the_head(dataset, tmp_path):
     recipe = default_recipe("v", "1d").replace(
         steps=6, z_size=4, batch=4, micro_batch=4, seed=2, validate_batches=1, validate_every=3, save_every=3

@@ -45,6 +45,7 @@ def test_bfloat16_is_near(lidar, shape):
     assert not torch.equal(fast, mu)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lidar", "size"), [("rings", 4101), ("1d", 1085)])
 def test_end_to_end_values_and_gradients_are_those_of_the_plain_network(lidar, size):
     torch.manual_seed(0)

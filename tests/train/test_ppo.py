@@ -54,6 +54,7 @@ def collect(ppo):
     return ppo.rollout_buffer
 
 
+@pytest.mark.slow
 def test_a_rollout_is_what_the_worlds_gave(parts):
     """Replayed through VecEnv's calls: same observations, rewards and ends, and truncations that are bootstrapped."""
     ppo = started(parts, 3, 200)  # long enough for timeouts: the untrained policy hardly arrives

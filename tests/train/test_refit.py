@@ -81,6 +81,7 @@ def test_a_controller_drives_as_before_through_a_v_that_says_the_same():
         assert torch.equal(p, before[name])
 
 
+@pytest.mark.slow
 def test_training_goes_on_from_it(tmp_path):
     init = given()
     recipe = default_controller_recipe("z", "1d").replace(

@@ -128,6 +128,7 @@ def test_a_differential_robot_gets_where_its_controller_wants_to_go():
     np.testing.assert_array_equal(velocity_commands(plain, [0.3, -0.2]), [0.3, -0.2, 0.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("features", "env", "sim"),
     [

@@ -81,6 +81,7 @@ def ship(trained, package, dataset):
     return w, c
 
 
+@pytest.mark.slow
 def test_shipped_weights_load_by_name_offline_and_say_whose_they_are(trained, package, dataset, capsys):
     w, c = ship(trained, package, dataset)
     capsys.readouterr()
@@ -177,6 +178,7 @@ def test_the_last_v_before_an_m_is_part_of_its_settings(tmp_path):
     assert [(one["model"], one["seed"]) for one in found["stages_before"]] == [("v", 1), ("m", 4)]
 
 
+@pytest.mark.slow
 def test_a_v_alone_may_be_the_stage_before(trained, package, dataset, tmp_path):
     settings = default_recipe("v", "1d").replace(steps=1, batch=8, micro_batch=8, validate_batches=1)
     train_world_model(settings, dataset, tmp_path / "v", preload=True)
@@ -187,6 +189,7 @@ def test_a_v_alone_may_be_the_stage_before(trained, package, dataset, tmp_path):
         shipping.ship(trained / "w", VARIANT, dataset, before=[tmp_path], **options)
 
 
+@pytest.mark.slow
 def test_names_lists_and_checks_know_them(trained, package, dataset, capsys):
     with pytest.raises(UnknownNameError, match=rf"means {VARIANT}\.v1.*does not contain it.*{VARIANT}\.released"):
         zoo.load(VARIANT)
@@ -221,6 +224,7 @@ def test_a_damaged_file_is_refused(trained, package, dataset):
         zoo.load(c.name)
 
 
+@pytest.mark.slow
 def test_cards_say_first_whose_weights_they_are(trained, package, dataset, tmp_path):
     w, c = ship(trained, package, dataset)
     written = {path.name: path.read_text() for path in cards.write_cards(tmp_path / "cards")}
@@ -241,6 +245,7 @@ def results_of(record, folder, dataset):
     return save(found, folder, dataset_record(dataset), weights_of(record.name)), found
 
 
+@pytest.mark.slow
 def test_measured_errors_reach_record_and_card(trained, package, dataset, tmp_path):
     w, _ = ship(trained, package, dataset)
     with pytest.raises(ConfigError, match="has no results of"):
@@ -281,6 +286,7 @@ def test_benchmarks_reach_record_and_card_with_the_goal_beside(trained, package,
         shipping.add_results(c.name, tmp_path / "b", root=package)
 
 
+@pytest.mark.slow
 def test_what_does_not_belong_together_is_not_shipped(trained, package, dataset, tmp_path, monkeypatch):
     recipes = package.parent / "recipes"
     options = {"root": package, "recipes": recipes}
@@ -337,6 +343,7 @@ def test_the_package_holds_what_records_say_and_not_too_much():
     assert sum(p.stat().st_size for p in there) <= names.SHIPPED_BYTES == 45_000_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("record", OWN, ids=lambda r: r.name)
 def test_shipped_weights(record, monkeypatch, tmp_path):
     monkeypatch.setenv("NAVREP_DATA_OFFLINE", "1")

@@ -79,6 +79,7 @@ def one_line(error):
 # --- losses fall ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "steps"), [("v", 12), ("joint", 12), ("transformer", 12)])
 def test_losses_fall(model, steps, dataset, tmp_path, pictures):
     done = train(recipe(model, "1d", steps=steps, precision="bfloat16"), dataset, tmp_path / "out")
@@ -233,6 +234,7 @@ def test_another_sensor_is_refused(dataset, tmp_path):
     one_line(error)
 
 
+@pytest.mark.slow
 def test_m_wants_codes_and_starts_only_from_its_own_kind(dataset, tmp_path, latents):
     with pytest.raises(CorruptDataError, match="navrep-data encode"):
         train_world_model(recipe("m", "1d", steps=1), dataset, tmp_path / "m")
@@ -245,6 +247,7 @@ def test_m_wants_codes_and_starts_only_from_its_own_kind(dataset, tmp_path, late
     one_line(error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["joint", "transformer"])
 def test_a_frozen_v_stays_and_the_memory_learns(model, dataset, tmp_path):
     started = recipe(model, "1d", steps=1, z_size=8, h_size=16)
@@ -267,6 +270,7 @@ def test_a_frozen_v_stays_and_the_memory_learns(model, dataset, tmp_path):
         recipe("v", "1d", freeze_v=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["joint", "transformer"])
 def test_world_models_start_from_a_v(model, dataset, tmp_path):
     v = train(recipe("v", "1d", steps=1, z_size=8), dataset, tmp_path / "v")

@@ -101,6 +101,7 @@ def test_an_action_acts_at_once_where_the_model_is_fed_the_one_taken(kind, delay
     assert [np.array_equal(x, y) for x, y in zip(a, b, strict=True)] == [delay == 1, False]
 
 
+@pytest.mark.slow
 def test_reaching_the_goal_ends_the_dream_and_time_cuts_it(dataset):
     env = DreamEnv(make("transformer"), dataset, goal_radius=25.0)
     env.reset(seed=0)

@@ -38,6 +38,7 @@ def moved(before, model):
     return any(not torch.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["transformer_rings_z.v1", "joint_1d_z.v1", "e2e_1d.v1"])
 def test_a_shipped_controller_learns_and_is_saved_by_stable_baselines3(name, tmp_path):
     model = zoo.load_sb3(name, env="navrep-train", n_envs=4, device="cpu", **FEW)
@@ -60,6 +61,7 @@ def test_a_shipped_controller_learns_and_is_saved_by_stable_baselines3(name, tmp
         assert moved(kept, again)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lidar", ["rings", "1d"])
 def test_end_to_end_networks_learn(lidar):
     model = to_sb3(end_to_end(lidar), "navrep-train", n_envs=2, **FEW)

@@ -47,6 +47,7 @@ def expected():
         EXPECTED[name] = drive(name)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_policies_are_the_same_whatever_torchs_defaults_are(name, other_settings):
     actions, kinds = drive(name)
@@ -68,6 +69,7 @@ def test_datasets_are_the_same_whatever_torchs_defaults_are(tmp_path, other_sett
     assert {value.device.type for value in window.values()} == {"cpu"}
 
 
+@pytest.mark.slow
 def test_nothing_is_drawn_from_global_generators(tmp_path):
     tiny_dataset(tmp_path / "tiny")
     controller = Controller(ControllerConfig(69))
