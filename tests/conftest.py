@@ -24,7 +24,7 @@ def pytest_sessionstart(session):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Tests of a file share its fixtures, so they share a process; pages of the docs have none and take longest."""
+    """Tests of a file share its fixtures, so they share a process; pages of the docs take longest and may be apart."""
     for item in items:
         page = item.name[:-1].partition("test_code_blocks_run[")[2]
         item.add_marker(pytest.mark.xdist_group(page or item.nodeid.partition("::")[0]))
