@@ -139,7 +139,8 @@ def bars(rows: Sequence[Row], groups: Sequence[Row], baseline: Row) -> Any:
             if level is not None:
                 label = f"goal, {words}"
                 ax.axhline(100 * level, color="black", linestyle=style, linewidth=0.8, zorder=1, label=label)
-        labels = [bar["label"] for bar in _series(rows, groups, part)]
+        # what a name says of feeding in brackets goes below it
+        labels = [str(bar["label"]).replace(" (", "\n(", 1) for bar in _series(rows, groups, part)]
         ax.set_xticks(range(n), labels, rotation=45, ha="right", rotation_mode="anchor", fontsize=8)
         ax.set_xlim(-0.6, n - 0.4)
         ax.set_title("all" if part is None else f"{MAP_GROUPS[part]} ({part})", fontsize=9)
