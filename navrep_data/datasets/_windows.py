@@ -31,7 +31,7 @@ def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
 
 def check_rows(name: str, value: Any) -> int:
     """Return `value` as int, or raise ConfigError unless it is a number of rows of at least 1."""
-    return check_whole(f"{name} in rows", value, 1)
+    return check_whole(name, value, 1)
 
 
 def open_folder(root: str | os.PathLike[str] | DatasetFolder) -> DatasetFolder:

@@ -394,7 +394,7 @@ def test_bad_arguments(made, tmp_path):
         SequenceDataset(tmp_path / "nothing")
     cases = [
         ({"lidar": "2d"}, ConfigError, "lidar is '2d', expected 'rings', '1d' or None"),
-        ({"window": 0}, ConfigError, "window in rows is 0, expected a whole number of at least 1"),
+        ({"window": 0}, ConfigError, "window is 0, expected a whole number of at least 1"),
         ({"window": 3.5}, ConfigError, "window is 3.5"),
         ({"stride": -1}, ConfigError, "stride is -1"),
         ({"split": "training"}, ConfigError, "split 'training'.*train, val, test"),
