@@ -45,7 +45,7 @@ def test_list(run):
     assert found[-1]["here"] is False
     (ours,) = run("e2e_1d.v1").stdout.splitlines()[1:]
     assert ours.split()[:5] == ["e2e_1d.v1", "policy", "1d", "0.55", "MB"]
-    assert re.search(r"\(68\.5\) % .* \(30\.5\) %  yes  = e2e_1d, ours$", ours)
+    assert re.search(r"\(68\.5\) % .* \(57\.4\) %  yes  = e2e_1d, ours$", ours)
     assert " rings " in run("modular_rings.v1").stdout
 
 
