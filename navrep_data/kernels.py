@@ -94,7 +94,8 @@ def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False) 
     -----
     A kernel has two sides, so that a first run compiles for half as long. The one that Python calls has a wrapper that
     takes arrays apart, which is mostly more code than the kernel. The one that other kernels call has none, and is
-    compiled once for all numbers: numba would compile it for each constant that it is called with.
+    compiled once for all numbers: numba would compile it for each constant that it is called with. ``prepare`` of what
+    is returned compiles that second side alone, for arguments of these types, without a call.
     """
     if function is None:
         return lambda function: kernel(function, inline=inline)
@@ -111,7 +112,18 @@ def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False) 
 
     # what numba asks a function for that a kernel calls
     outer.get_call_template, outer.get_overload = get_call_template, inner.get_overload
+    typeof: Any = numba.typeof
+    outer.prepare = lambda arguments: inner.compile(tuple(map(typeof, arguments)))
     return outer
+
+
+def is_missing(compiled: Any) -> bool:
+    """Return whether a kernel that Python calls is not in the cache folder, and would be kept there.
+
+    It is not looked for which types of arguments it was compiled.
+    """
+    folder = getattr(getattr(compiled, "stats", None), "cache_path", None)  # None: plain Python, or no cache
+    return folder is not None and not any(Path(folder).glob(f"*.{compiled.__name__}-*.nbi"))
 
 
 def _compiled(function: Callable[..., Any], side: str, options: Mapping[str, Any]) -> Any:

@@ -199,6 +199,7 @@ def _frames(episode: Episode) -> Iterator[Any]:
         for one in axes.values():
             one.set(xticks=[], yticks=[], xlabel="", ylabel="")
         figure.canvas.draw()
+        figure.set_layout_engine("none")  # frames have no labels, so the first one's places do for all
         yield Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
 
 

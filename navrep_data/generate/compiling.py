@@ -1,15 +1,30 @@
-"""Tell that kernels are being compiled, while they are."""
+"""Compile kernels ahead of a first run, in two processes, and tell that they are being compiled.
+
+``python -m navrep_data.generate.compiling DTYPE`` is the second process: DTYPE is how scans are stored, which is all
+that the kernels' types depend on.
+"""
 
 from __future__ import annotations
 
 import gc
+import os
+import subprocess
+import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from numba.core import event as numba_event
 from tqdm import tqdm
 
+from navrep_data.generate.worker import DatasetSpec, new_writer
+from navrep_data.kernels import is_missing
+from navrep_data.sim import RolloutSettings, ScriptedPolicy, ScriptedRollout, make_config
+from navrep_data.sim._rollout import rollout_sequence
+
 _events: Any = numba_event  # untyped
+BLANK_ROWS = 10
+
 _COMPILES = "numba:compile"  # not heard where a kernel comes from the cache
 
 
@@ -54,3 +69,42 @@ class Compiling(numba_event.Listener):
         """Count a kernel."""
         if self._bar is not None:
             self._bar.update()
+
+
+def compile_ahead(spec: DatasetSpec) -> None:
+    """Compile what scripted rollouts in worlds of polygons need, half of it in another process; does nothing later on.
+
+    Kernels are kept in a cache folder, so that this process finds there what the other one compiled. Where that fails,
+    or ends early, this one compiles it all when it calls it.
+
+    Parameters
+    ----------
+    spec : DatasetSpec
+        What will be made: under a scripted policy, and not on maps.
+    """
+    if not is_missing(rollout_sequence) or (os.cpu_count() or 1) < 2:
+        return
+    helper = subprocess.Popen(
+        [sys.executable, "-m", __name__, spec.settings.scan_dtype],
+        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        short = replace(spec, settings=replace(spec.settings, length=BLANK_ROWS))
+        rollout = ScriptedRollout(short.config, short.settings, ScriptedPolicy("orca"), seed=0)
+        for kernel, arguments in rollout.parts()[1]:
+            kernel.prepare(arguments)
+        writer = new_writer(short, 0)
+        writer.append(rollout.blank())
+        writer.finish()
+        helper.wait()
+    finally:
+        helper.kill()
+        helper.wait()
+
+
+if __name__ == "__main__":
+    gc.disable()
+    settings = RolloutSettings(length=BLANK_ROWS, scan_dtype=sys.argv[1])
+    rollout = ScriptedRollout(make_config("soadrl"), settings, ScriptedPolicy("orca"), seed=0)
+    for kernel, arguments in rollout.parts()[0]:
+        kernel.prepare(arguments)

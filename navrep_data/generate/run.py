@@ -10,7 +10,7 @@ from dataclasses import replace
 from tqdm import tqdm
 
 from navrep_data.errors import CorruptDataError, DatasetError, DatasetMismatchError, NavrepDataError
-from navrep_data.generate.compiling import Compiling
+from navrep_data.generate.compiling import Compiling, compile_ahead
 from navrep_data.generate.executors import LocalExecutor, RayExecutor
 from navrep_data.generate.plan import Request, check_manifest, check_same, check_space, new_manifest, versions
 from navrep_data.generate.storage import check_storage, check_visible
@@ -143,7 +143,9 @@ class Run:
             self.say(f"{self.home} already holds all {self.request.sequences} sequences; nothing to do.")
             return
         with make_executor(self.request.spec, len(tasks)) as executor:
-            self._announce(done_rows, executor, progress)
+            with Compiling(self.say, progress):
+                per_row = self._prepare(executor)
+            self._announce(done_rows, executor, per_row)
             if self._entries or not (self.home / MANIFEST_FILE).exists():
                 self._save()
             self.began = time.perf_counter()
@@ -173,14 +175,17 @@ class Run:
                     self._save()
                 raise
 
-    def _announce(self, done_rows: int, executor: LocalExecutor | RayExecutor, progress: bool) -> None:
-        if self.say is silent:
-            return  # the estimate costs a few hundred rows
+    def _prepare(self, executor: LocalExecutor | RayExecutor) -> float | None:
+        """Compile what workers like this process need; return how long a row will take [s] where somebody is told."""
+        spec = self.request.spec
+        if not spec.policy.scripted or not executor.like_here:
+            return None
+        if not spec.config.maps:
+            compile_ahead(spec)
+        return None if self.say is silent else seconds_per_row(spec)  # costs a few hundred rows
+
+    def _announce(self, done_rows: int, executor: LocalExecutor | RayExecutor, per_row: float | None) -> None:
         r, s = self.request, self.request.spec
-        per_row = None
-        if s.policy.scripted and executor.like_here:
-            with Compiling(self.say, progress):
-                per_row = seconds_per_row(s)
         todo = r.rows - done_rows
         place = s.storage or s.root
         text = (

@@ -62,6 +62,8 @@ MOMENTUM_LIMIT = 0.5
 GOAL_PULL = 0.05
 # ours: the fastest turn of a differential drive towards the direction in which a policy wants to go [rad/s]
 STEER_LIMIT = 1.0
+# what finish_row returns, beside events, after an episode's last row
+OVER = -1
 
 
 @kernel
@@ -249,17 +251,17 @@ def begin_row(
 
 @kernel
 def finish_row(
-    row, length, pending, gave_up, action, agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i,
-    boxes, rng, params, flags, orca_params, work_f, work_i, moves, result, out_floats, out_ints,
+    row, length, pending, gave_up, action, agents, agents32, scalars, polygon_start, edges, obst_f, obst_i, boxes,
+    params, flags, orca_params, work_f, work_i, moves, result, out_floats, out_ints,
 ):  # fmt: skip
     """Take the row's action, or end its episode; returns the event that ends the episode at the next row.
 
-    `pending` is that event from the row before. -1 is returned where no new world could be made.
+    `pending` is that event from the row before. OVER is returned where this row is its episode's last: worlds are made
+    anew by the caller, so that a first run can compile that and this in two processes at the same time.
     """
-    last = row == length - 1
     if pending != NONE:
         out_ints[row, 0] = pending
-    elif last:
+    elif row == length - 1:
         out_ints[row, 0] = CUT
     elif gave_up:
         out_ints[row, 0] = STUCK
@@ -277,12 +279,7 @@ def finish_row(
         out_floats[row, 5], out_floats[row, 6], out_floats[row, 7] = action[0], action[1], action[2]
         out_floats[row, 8] = result[0]
         return int(result[flags[F_ROBOTS]])
-    if not last and not reset_world(
-        agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags,
-        orca_params, work_f, work_i, moves,
-    ):  # fmt: skip
-        return -1
-    return NONE
+    return OVER
 
 
 @kernel
@@ -321,12 +318,16 @@ def rollout_sequence(
                 memory, action,
             )  # fmt: skip
         pending = finish_row(
-            row, length, pending, gave_up, action, agents, agents32, scalars, vertices, polygon_start, edges,
-            obst_f, obst_i, boxes, rng, params, flags, orca_params, work_f, work_i, moves, result,
-            out_floats, out_ints,
+            row, length, pending, gave_up, action, agents, agents32, scalars, polygon_start, edges, obst_f, obst_i,
+            boxes, params, flags, orca_params, work_f, work_i, moves, result, out_floats, out_ints,
         )  # fmt: skip
-        if pending < 0:
-            return False
+        if pending == OVER:
+            pending = NONE
+            if row < length - 1 and not reset_world(
+                agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, params, flags,
+                orca_params, work_f, work_i, moves,
+            ):  # fmt: skip
+                return False
     return True
 
 
@@ -352,10 +353,15 @@ def finish_rows(
     """Call :func:`finish_row` on every world of a batch; returns False if one could not be made anew."""
     for w in range(agents.shape[0]):
         pending[w] = finish_row(
-            row, length, pending[w], gave_up[w], actions[w], agents[w], agents32, scalars[w], vertices[w],
-            polygon_start[w], edges[w], obst_f[w], obst_i[w], boxes[w], rng[w], params, flags, orca_params,
-            work_f, work_i, moves, result, out_floats[w], out_ints[w],
+            row, length, pending[w], gave_up[w], actions[w], agents[w], agents32, scalars[w], polygon_start[w],
+            edges[w], obst_f[w], obst_i[w], boxes[w], params, flags, orca_params, work_f, work_i, moves, result,
+            out_floats[w], out_ints[w],
         )  # fmt: skip
-        if pending[w] < 0:
-            return False
+        if pending[w] == OVER:
+            pending[w] = NONE
+            if row < length - 1 and not reset_world(
+                agents[w], agents32, scalars[w], vertices[w], polygon_start[w], edges[w], obst_f[w], obst_i[w],
+                boxes[w], rng[w], params, flags, orca_params, work_f, work_i, moves,
+            ):  # fmt: skip
+                return False
     return True

@@ -132,7 +132,8 @@ def _build(
         field_goal=np.array(fields.goals or [(0.0, 0.0)], np.float64),
         scenarios=rows,
         cast=cast,
-        spots=np.concatenate(spots) if spots else np.zeros((0, 2)),
+        # kernels are compiled for one order of axes, and parts without rows may have either
+        spots=np.ascontiguousarray(np.concatenate(spots)) if spots else np.zeros((0, 2)),
         pool=np.array(pools or [0], np.int64),
     )
     for array in (*tables, *edges):

@@ -14,7 +14,8 @@ from navrep_data.observations import scan_to_rings
 from navrep_data.schema import ACTION_SIZE, HUMAN_FIELDS, RINGS_SHAPE, Event
 from navrep_data.sim import _layout as lay
 from navrep_data.sim._batch import reset_worlds, seed_worlds
-from navrep_data.sim._rollout import begin_rows, finish_rows, rollout_sequence
+from navrep_data.sim._rollout import begin_row, begin_rows, choose_actions, finish_row, finish_rows, rollout_sequence
+from navrep_data.sim._step import reset_world
 from navrep_data.sim.config import SimConfig
 from navrep_data.sim.driving import RobotPolicy, knows_robots
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
@@ -126,6 +127,9 @@ def _worlds(out: _Outputs, w: int, sequence: int) -> dict[str, NDArray[Any]]:
 SequenceRows = tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]
 """Columns of one sequence and the static side of its episodes."""
 
+Prepared = tuple[Any, tuple[Any, ...]]
+"""A kernel, and arguments of the types that it is called with."""
+
 
 class ScriptedRollout:
     """Roll out sequences under a scripted policy, entirely inside the kernels.
@@ -155,6 +159,39 @@ class ScriptedRollout:
         self.arrays.params[lay.P_STUCK_SPEED] = policy.stuck_speed
         self.arrays.params[lay.P_OMEGA_NOISE] = policy.omega_noise
         self.arrays.params[lay.P_POLICY_SPEED] = policy.speed
+
+    def parts(self) -> tuple[tuple[Prepared, ...], tuple[Prepared, ...]]:
+        """Return the kernels within :meth:`run`, with arguments, in two halves that compile for about as long."""
+        a, out = self.arrays, self._out
+        agents, scalars, orca = a.agents[0], a.scalars[0], (a.orca_params, a.work_f, a.work_i)
+        static = (a.vertices[0], a.polygon_start[0], a.edges[0])
+        three = np.zeros(3)
+        begin = (reset_world, (
+            agents, a.agents32, scalars, *static, a.obst_f[0], a.obst_i[0], a.boxes[0], a.rng[0], a.params, a.flags,
+            *orca, a.moves,
+        ))  # fmt: skip
+        observe = (begin_row, (
+            0, agents, scalars, *static, a.circles, a.dirs, a.inv_work, a.owner_work, a.hits[0], a.scans[0], a.params,
+            a.flags, out.scan[0], out.floats[0], out.ints[0], out.humans[0], out.episodes[0], out.corners[0],
+            out.sizes[0], out.table[0], out.counts[0],
+        ))  # fmt: skip
+        choose = (choose_actions, (
+            agents, a.agents32, scalars, a.obst_f[0], a.obst_i[0], a.rng[0], a.params, a.flags, *orca, three, three,
+        ))  # fmt: skip
+        finish = (finish_row, (
+            0, 0, 0, False, three, agents, a.agents32, scalars, a.polygon_start[0], a.edges[0], a.obst_f[0],
+            a.obst_i[0], a.boxes[0], a.params, a.flags, *orca, a.moves, three, out.floats[0], out.ints[0],
+        ))  # fmt: skip
+        return (observe, begin), (choose, finish)
+
+    def blank(self) -> dict[str, NDArray[Any]]:
+        """Return columns as :meth:`run` does, of one episode of zeros that is cut at its end; nothing is simulated."""
+        out = self._out
+        for array in (out.scan, out.floats, out.ints, out.humans):
+            array[...] = 0
+        out.ints[0, :, 2] = np.arange(self.settings.length)
+        out.ints[0, -1, 0] = Event.CUT
+        return _columns(out, 0, 0, self.settings)
 
     def run(self, sequences: Sequence[int]) -> list[SequenceRows]:
         """Return the rows of one sequence; the arrays are overwritten by the next call."""

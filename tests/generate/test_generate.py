@@ -28,10 +28,11 @@ from navrep_data.errors import (
     PolicyError,
     SchemaVersionError,
 )
-from navrep_data.generate import driver, executors, generate, plan
+from navrep_data.generate import compiling, driver, executors, generate, plan
 from navrep_data.generate.compiling import Compiling
 from navrep_data.io import json_bytes
 from navrep_data.shards import DatasetFolder, Manifest, verify, writer_lock
+from navrep_data.sim import RolloutSettings, ScriptedPolicy, ScriptedRollout, make_config
 
 SMALL = {"humans": 4, "obstacles": 3, "length": 30, "shard_size": 2, "seed": 5}
 
@@ -455,6 +456,26 @@ def test_worlds_without_polygons_feed_datasets(tmp_path, env):
     with pytest.raises(ConfigError, match="world='empty', obstacles=3 cannot be combined"):
         generate(env=env, n=1, out=tmp_path / "e", obstacles=3)
     assert not (tmp_path / "e").exists()
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason="kernels are plain Python here")
+@pytest.mark.parametrize("scan_dtype", ["uint16", "float32"])
+def test_what_is_compiled_ahead_is_what_a_sequence_calls(scan_dtype, monkeypatch, tmp_path):
+    small = {"n": 1, "length": 3, "scan_dtype": scan_dtype}
+    generate(out=tmp_path / "first", **small)
+    rollout = ScriptedRollout(
+        make_config("soadrl"), RolloutSettings(length=3, scan_dtype=scan_dtype), ScriptedPolicy("orca"), seed=0
+    )
+    said = []
+    with Compiling(said.append, progress=False):
+        for kernel, arguments in (*rollout.parts()[0], *rollout.parts()[1]):
+            kernel.prepare(arguments)
+        monkeypatch.setattr(compiling, "is_missing", lambda kernel: True)
+        monkeypatch.setattr(compiling.os, "cpu_count", lambda: 2)
+        generate(out=tmp_path / "second", **small)
+    assert said == []  # all of it was there: the types are the same
+    helper = subprocess.run([sys.executable, "-m", "navrep_data.generate.compiling", scan_dtype], timeout=300)
+    assert helper.returncode == 0
 
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason="kernels are plain Python here")

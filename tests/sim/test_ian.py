@@ -11,6 +11,7 @@ from navrep_data.errors import ConfigError, MissingExtraError, UnknownNameError
 from navrep_data.schema import Event
 from navrep_data.sim import Simulator, make_config, map_names
 from navrep_data.sim import _layout as lay
+from navrep_data.sim.map_tables import map_world_data
 
 ORIGIN = np.zeros(2)
 
@@ -27,6 +28,15 @@ def one(physics: str, scenario: str, heading: float, seed: int = 0, **fields: An
     simulator = Simulator(make_config("ian", physics=physics, scenarios=(scenario,), **fields))
     simulator.reset_scenarios([scenario], [seed], headings=[heading])
     return simulator
+
+
+@pytest.mark.parametrize("physics", ["consistent", "original"])
+@pytest.mark.parametrize("env", ["map", "ian"])
+def test_tables_have_one_order_of_axes(env: str, physics: str) -> None:
+    """Another order is another type: all kernels of maps would be compiled once more."""
+    fields = {"maps": tuple(map_names()[:1])} if env == "map" else {}
+    data = map_world_data(make_config(env, physics=physics, **fields))
+    assert all(array.flags.c_contiguous for array in (*data.tables, *data.edges))
 
 
 # --- the listed defects: there in `original`, gone in `consistent` ---------------------------------------------------
