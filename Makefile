@@ -50,7 +50,7 @@ coverage: $(STAMP)  ## Line coverage of sim and observations, measured on plain 
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) --numprocesses $(JOBS) --cov=navrep_data.sim --cov=navrep_data.observations \
 	  --cov-report=term --cov-fail-under=95 $(PYTEST_ARGS)
 
-kill-test: $(STAMP)  ## 200 random SIGKILLs of generate (CI runs 6).
+kill-test: $(STAMP)  ## 200 random SIGKILLs of generate (CI runs 4).
 	NAVREP_DATA_KILLS=200 $(BIN)/python -m pytest -m slow tests/generate/test_kill.py -s
 
 # seconds in all; FUZZ_ARGS="--only shard map" for some readers, --seed N to see a finding again

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+# Networks here are small and test processes share the cores: threads that wait for each other would take half of them.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parent / "no_network"))
 
 import loopback_only

@@ -202,7 +202,7 @@ def test_sigkill_of_the_driver_loses_nothing(reference, tmp_path):
     root = tmp_path / "d"
     code = (
         "from navrep_data.generate import generate\n"
-        f"if __name__ == '__main__': generate(n=7, out={str(root)!r}, workers=2, **{SMALL!r})\n"
+        f"if __name__ == '__main__': generate(n=7, out={str(root)!r}, **{SMALL!r})\n"
     )
     script = tmp_path / "run.py"
     script.write_text(code)

@@ -1,6 +1,6 @@
 """Real SIGKILLs at random moments, of the driver or of a worker: nothing is lost, the end is the same bytes.
 
-CI runs 6 kills; ``make kill-test`` runs 200 (NAVREP_DATA_KILLS).
+CI runs 4 kills; ``make kill-test`` runs 200 (NAVREP_DATA_KILLS).
 """
 
 import hashlib
@@ -18,7 +18,7 @@ import pytest
 from navrep_data.generate import generate
 from navrep_data.shards import Manifest, verify
 
-KILLS = int(os.environ.get("NAVREP_DATA_KILLS", "6"))
+KILLS = int(os.environ.get("NAVREP_DATA_KILLS", "4"))
 SETTINGS = {"n": 24, "length": 250, "humans": 8, "obstacles": 4, "shard_size": 1, "seed": 3}
 
 
