@@ -26,7 +26,7 @@ demo: $(STAMP)  ## Generate a small dataset, print its summary, load windows thr
 	$(BIN)/python examples/load_windows.py $(DEMO)
 
 test: $(STAMP)  ## Run the whole test suite, slow tests included.
-	$(BIN)/python -m pytest -m "slow or not slow" --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m "slow or not slow" --numprocesses $(JOBS) --dist loadscope --no-loadscope-reorder $(PYTEST_ARGS)
 
 check: $(STAMP)  ## Format, lint, types, import contracts.
 	$(BIN)/ruff format --check .

@@ -16,6 +16,12 @@ from recorded import AUTHORS
 
 loopback_only.install()
 
+PAGES = "test_code_blocks_run["
+LONGEST = (
+    "test_code_blocks_run[tour", "test_code_blocks_run[README", PAGES, "test_ray.py", "test_push_pull.py",
+    "evaluate/test_workers.py", "test_controllers.py", "test_training.py", "test_fuzz.py", "test_generate.py",
+)  # fmt: skip
+
 
 def pytest_sessionstart(session):
     """Where several processes are about to run tests: compile once what each of them would compile."""
@@ -25,13 +31,21 @@ def pytest_sessionstart(session):
         assert [process.wait() for process in compiling] == [0, 0]
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Tests of a file share its fixtures, so they share a process; pages of the docs take longest and may be apart."""
-    for item in items:
-        page = item.name[:-1].partition("test_code_blocks_run[")[2]
-        item.add_marker(pytest.mark.xdist_group(page or item.nodeid.partition("::")[0]))
-    items.sort(key=lambda item: not item.name.startswith("test_code_blocks_run"))  # stable: these first
+    """What takes longest begins first, so that no process is left alone with it in the end."""
+    items.sort(key=lambda item: next((k for k, name in enumerate(LONGEST) if name in item.nodeid), len(LONGEST)))
+
+
+@pytest.hookimpl(optionalhook=True)  # of pytest-xdist
+def pytest_xdist_make_scheduler(config, log):
+    """Let tests of a file share a process, and so its fixtures; pages of the docs may be apart."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            return nodeid if PAGES in nodeid else nodeid.partition("::")[0]
+
+    return ByFile(config, log)
 
 
 @pytest.fixture(scope="session")

@@ -136,8 +136,7 @@ def _build(
         spots=np.ascontiguousarray(np.concatenate(spots)) if spots else np.zeros((0, 2)),
         pool=np.array(pools or [0], np.int64),
     )
-    for array in (*tables, *edges):
-        array.setflags(write=False)
+    # not made read-only, though nobody writes here: that is another type to a compiler, and copies would lose it
     return MapWorldData(maps, scenarios, tables, edges)
 
 

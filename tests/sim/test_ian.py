@@ -32,11 +32,13 @@ def one(physics: str, scenario: str, heading: float, seed: int = 0, **fields: An
 
 @pytest.mark.parametrize("physics", ["consistent", "original"])
 @pytest.mark.parametrize("env", ["map", "ian"])
-def test_tables_have_one_order_of_axes(env: str, physics: str) -> None:
-    """Another order is another type: all kernels of maps would be compiled once more."""
+def test_tables_have_one_type(env: str, physics: str) -> None:
+    """Another order of axes, or read-only arrays, are other types: kernels would be compiled once more."""
     fields = {"maps": tuple(map_names()[:1])} if env == "map" else {}
     data = map_world_data(make_config(env, physics=physics, **fields))
-    assert all(array.flags.c_contiguous for array in (*data.tables, *data.edges))
+    for array in (*data.tables, *data.edges):
+        assert array.flags.c_contiguous
+        assert array.flags.writeable
 
 
 # --- the listed defects: there in `original`, gone in `consistent` ---------------------------------------------------
