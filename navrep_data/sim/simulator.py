@@ -404,7 +404,7 @@ class Simulator:
             :class:`navrep_data.schema.Event` codes; 0 = the episode goes on.
         """
         a = self.arrays
-        commands = np.require(actions, np.float64, "CW")  # read-only arrays are a type of their own to a compiler
+        commands = np.require(actions, np.float64, ["C", "W"])  # read-only arrays are a type of their own to a compiler
         expected = (self.n_worlds, *self._per_robot, ACTION_SIZE)
         if commands.shape != expected:
             raise ConfigError(f"actions have shape {commands.shape}, expected {expected}.")
