@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from navrep_data.cli._common import print_json, say
+from navrep_data.cli._common import print_json, say, say_err
 
 
 def import_npz_command(
@@ -25,7 +25,7 @@ def import_npz_command(
     """Convert sequences recorded by the original NavRep into a dataset."""
     from navrep_data.datasets import import_npz
 
-    manifest = import_npz(files, out, env=env, range_max=range_max)
+    manifest = import_npz(files, out, env=env, range_max=range_max, report=say_err)
     if as_json:
         print_json(
             {

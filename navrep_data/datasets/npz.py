@@ -24,6 +24,7 @@ from navrep_data.errors import (
 from navrep_data.io import new_folder, raise_refusal, sha256_file
 from navrep_data.io.npz import PLAIN_METHODS
 from navrep_data.observations import scan_to_rings
+from navrep_data.observations.blind import declaration, runs_of
 from navrep_data.schema import (
     ACTION_SIZE,
     COLUMNS,
@@ -267,6 +268,7 @@ def import_npz(
     dt: float = DT,
     rings: bool = True,
     progress: Callable[[int, int], None] | None = None,
+    report: Callable[[str], None] | None = None,
 ) -> Manifest:
     """Turn sequences recorded by the original software into a dataset.
 
@@ -287,11 +289,13 @@ def import_npz(
         Store rings too (else they are computed when read).
     progress : callable, optional
         Called with (files done, files) after each file.
+    report : callable, optional
+        Receives a line that says which rays no scan has seen anything with, if there are any.
 
     Returns
     -------
     Manifest
-        Of the new dataset.
+        Of the new dataset; ``config["blind_rays"]`` are those that are 0 in every scan, as [first, last].
 
     Raises
     ------
@@ -326,16 +330,35 @@ def import_npz(
         raise ConfigError(f"range_max is {range_max} m and dt {dt} s, expected positive numbers.")
     with new_folder(out, what="an import") as part:
         lengths = [_load(path, read=False)[0] for path in files]
-        manifest = _plan(files, lengths, env, SensorContract(range_max=float(range_max), dt=float(dt)), rings)
+        sensor = SensorContract(range_max=float(range_max), dt=float(dt))
+        blind = _never_seen(files, sensor)
+        if blind.any() and report is not None:
+            report(declaration(blind, sensor))
+        manifest = _plan(files, lengths, env, sensor, rings, runs_of(blind))
         return _write(part, manifest, files, range_max, rings, progress)
 
 
-def _plan(files: Sequence[Path], lengths: Sequence[int], env: str, sensor: SensorContract, rings: bool) -> Manifest:
+def _never_seen(files: Sequence[Path], sensor: SensorContract) -> npt.NDArray[np.bool_]:
+    """Return which rays are 0 in every scan of all files, (n_rays,); reads on only while there may be such."""
+    blind = np.ones(sensor.n_rays, np.bool_)
+    for path in files:
+        blind &= (_clean_scans(_load(path)[1]["scans"], sensor.range_max, path) == 0.0).all(axis=0)
+        if not blind.any():
+            break
+    return blind
+
+
+def _plan(
+    files: Sequence[Path], lengths: Sequence[int], env: str, sensor: SensorContract, rings: bool,
+    blind: list[tuple[int, int]],
+) -> Manifest:  # fmt: skip
     """Return the manifest of the dataset before any shard is written."""
-    config = {
+    config: dict[str, Any] = {
         "source": [{"file": path.name, "sha256": sha256_file(path)} for path in files],
         "collision_events": "the source does not tell humans from obstacles: all are collision_obstacle",
     }
+    if blind:
+        config["blind_rays"] = [list(run) for run in blind]
     return Manifest(
         env=env,
         physics="imported",

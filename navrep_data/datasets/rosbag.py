@@ -23,7 +23,7 @@ from navrep_data.datasets.npz import MAX_ROWS_PER_SHARD, MAX_SEQUENCES_PER_SHARD
 from navrep_data.errors import ConfigError, DatasetError
 from navrep_data.io import new_folder, sha256_bytes, sha256_file
 from navrep_data.observations import scan_to_rings
-from navrep_data.observations.blind import describe_rays, runs_of
+from navrep_data.observations.blind import declaration, runs_of
 from navrep_data.schema import COLUMNS, DT, MAX_COORDINATE, RANGE_MAX, SensorContract
 from navrep_data.shards import Manifest, ShardEntry, ShardWriter, dataset_card, publish
 
@@ -205,11 +205,7 @@ def _blind_rays(
     for r in recordings:
         blind |= r.tracks.book.never_seen(sensor)
     if blind.any():
-        where = describe_rays(blind, sensor.angle_min, sensor.angle_increment)
-        say(
-            f"{int(blind.sum())} of {sensor.n_rays} rays are blind in every scan ({where}): they are 0, unknown in "
-            "rings, and declared in the manifest (blind_rays)"
-        )
+        say(declaration(blind, sensor))
     return [[a, b] for a, b in runs_of(blind)]
 
 

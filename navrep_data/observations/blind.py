@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from navrep_data.errors import ArrayError
 from navrep_data.observations import _adapter
 from navrep_data.observations.rings import N_SECTIONS
+from navrep_data.schema import SensorContract
 
 BLIND_RANGE = 1.0
 """Range [m] that models which read ranges are shown, at most, in a sector that nobody saw.
@@ -78,6 +79,15 @@ def describe_rays(rays: NDArray[np.bool_], angle_min: float, angle_increment: fl
     first, step = math.degrees(angle_min), math.degrees(angle_increment)
     sectors = [f"{first + a * step:.0f} to {first + b * step:.0f} deg" for a, b in runs_of(rays)]
     return ", ".join(sectors[:_LISTED]) + (f" and {len(sectors) - _LISTED} more" if len(sectors) > _LISTED else "")
+
+
+def declaration(rays: NDArray[np.bool_], sensor: SensorContract) -> str:
+    """Return what an import says of rays (n_rays,) that no scan of a recording has seen anything with."""
+    where = describe_rays(rays, sensor.angle_min, sensor.angle_increment)
+    return (
+        f"{int(rays.sum())} of {sensor.n_rays} rays are blind in every scan ({where}): they are 0, unknown in rings, and "
+        "declared in the manifest (blind_rays)"
+    )
 
 
 def runs_of(rays: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -173,7 +173,6 @@ def _encode_shard(
     mu = np.empty((shard.rows, vae.config.z_size), np.float32)
     logvar = np.empty_like(mu)
     stored_rings = vae.config.lidar == "rings" and "rings" in folder.manifest.columns
-    range_max = folder.manifest.sensor.range_max
     for first in range(0, shard.rows, _BATCH):
         stop = min(shard.rows, first + _BATCH)
         if stored_rings:
@@ -182,8 +181,6 @@ def _encode_shard(
             scan = shard.read("scan", first, stop)
             # as datasets give it: divided, not multiplied, so that rings equal the stored ones
             metres = scan.astype(np.float32) / np.float32(1.0 / SCAN_SCALE) if scan.dtype == np.uint16 else scan
-            if vae.config.lidar == "1d":
-                metres = np.where(metres == 0.0, np.float32(range_max), metres)
             obs = observation_from_scan(metres, vae.config.lidar)
         means, logvars = passes.distribution(vae, obs.to(device), passes.PRECISIONS[precision])
         mu[first:stop], logvar[first:stop] = means.cpu().numpy(), logvars.cpu().numpy()

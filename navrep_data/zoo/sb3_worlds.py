@@ -109,7 +109,9 @@ class ControllerWorlds(VecEnvWrapper):
     -----
     Actions are clipped to [-1, 1] and shortened to the controller's `max_speed`: they are shares of the robot's largest
     velocities. A differential drive turns to where they point (:func:`navrep_data.sim.velocity_commands`). Memories are
-    told what the robot did, scans of other sensors go through :class:`navrep_data.observations.ScanAdapter`.
+    told what the robot did, scans of other sensors go through :class:`navrep_data.observations.ScanAdapter`. A robot
+    that is slower or larger than the policy's is not shown in proportion, as it is where the policy drives: it is what
+    the controller is to learn.
     """
 
     def __init__(self, venv: VecEnv, policy: Policy) -> None:

@@ -113,6 +113,18 @@ def test_a_small_file(tmp_path):
     assert np.isnan(columns["robot_pose"]).all()
 
 
+def test_rays_that_saw_nothing_in_any_file_are_declared(tmp_path):
+    sources = [sequence(), sequence(seed=3)]
+    sources[0]["scans"][:, 400:700] = np.nan
+    sources[1]["scans"][:, 500:800] = np.nan
+    said = []
+    manifest = import_npz(write(tmp_path / "in", *sources), tmp_path / "out", report=said.append)
+    assert manifest.config["blind_rays"] == [[500, 699]]
+    assert len(said) == 1
+    assert said[0].startswith("200 of 1080 rays are blind in every scan (167 to 233 deg)")
+    assert "blind_rays" not in import_npz(write(tmp_path / "other", sequence()), tmp_path / "seen").config
+
+
 def test_timeouts(tmp_path):
     source = sequence(400, ends=(175, 351, 399), unplayed=(), goals=(351,), crashes=())
     import_npz(write(tmp_path / "in", source), tmp_path / "out")

@@ -195,7 +195,7 @@ def test_m_dreams_until_an_episode_ends():
         for length in range(1, last - first):
             actions = action[dreaming][:, first : first + length]
             h, _ = memory.hidden(memory.inputs(dream, ahead_goal, actions, flags[:, :length]))
-            change = memory.mixture(h[:, -1:]).likeliest()
+            change = memory.mixture(h[:, -1:]).expected()
             dream = torch.cat([dream, dream[:, -1:] + change[..., :8]], 1)
             ahead_goal = torch.cat([ahead_goal, ahead_goal[:, -1:] + change[..., 8:] * 25.0], 1)
         torch.testing.assert_close(fed[dreaming][:, first:last], dream, atol=1e-5, rtol=1e-4)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from navrep_data.datasets import LatentDataset, SequenceDataset
+from navrep_data.datasets import LatentDataset, SequenceDataset, import_npz
 from navrep_data.errors import (
     CheckpointError,
     ConfigError,
@@ -389,6 +389,24 @@ def test_codes_are_those_of_the_rows(dataset, latents):
     torch.testing.assert_close(b["logvar"][b["mask"]], logvar, rtol=1e-4, atol=1e-5)
     led = LatentDataset(codes, window=20, split="train", action="leading").batch(index)
     assert torch.equal(led["action"][:, 1:][led["mask"][:, 1:]], a["action"][:, :-1][led["mask"][:, 1:]])
+
+
+def test_codes_of_blind_rays_are_those_that_v_was_trained_with(tmp_path):
+    rng = np.random.default_rng(0)
+    scans = rng.uniform(0.5, 3.0, (40, 1080)).astype(np.float32)
+    scans[:, 300:700] = np.nan
+    arrays = {"scans": scans, "robotstates": rng.normal(size=(40, 5)), "actions": rng.normal(size=(40, 3)),
+              "rewards": np.zeros(40), "dones": np.arange(40) == 39}  # fmt: skip
+    np.savez_compressed(tmp_path / "000_scans_robotstates_actions_rewards_dones.npz", **arrays)
+    import_npz(tmp_path, tmp_path / "d")
+    torch.manual_seed(1)
+    vae = VAE(VAEConfig("1d", 8))
+    encode_dataset(tmp_path / "d", vae, tmp_path / "codes")
+    seen = SequenceDataset(tmp_path / "d", "1d", window=40, scan_unit="normalized", invalid="near").batch([0])
+    with torch.no_grad():
+        mu, _ = vae.distribution(seen["scan"][seen["mask"]])
+    found = LatentDataset(tmp_path / "codes", window=40).batch([0])
+    torch.testing.assert_close(found["mu"][found["mask"]], mu, rtol=1e-4, atol=1e-5)
 
 
 def test_encoding_rings_equals_windows_of_rings(dataset, tmp_path):
