@@ -85,8 +85,8 @@ def declaration(rays: NDArray[np.bool_], sensor: SensorContract) -> str:
     """Return what an import says of rays (n_rays,) that no scan of a recording has seen anything with."""
     where = describe_rays(rays, sensor.angle_min, sensor.angle_increment)
     return (
-        f"{int(rays.sum())} of {sensor.n_rays} rays are blind in every scan ({where}): they are 0, unknown in rings, and "
-        "declared in the manifest (blind_rays)"
+        f"{int(rays.sum())} of {sensor.n_rays} rays are blind in every scan ({where}): they are 0, unknown in rings, "
+        "and declared in the manifest (blind_rays)"
     )
 
 

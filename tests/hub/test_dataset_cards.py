@@ -43,6 +43,13 @@ def test_cards_are_current():
         assert manifest.card_sha256 == sha256_file(FOLDER / f"{env}.md")
 
 
+@pytest.mark.parametrize("env", ENVS)
+def test_no_person_of_a_published_dataset_is_faster_than_people_walk(env):
+    """ORCA once let one in 7,000 steps go at up to 4 m/s; the largest preferred speed is 1.2 m/s."""
+    humans = cards.read_published(FOLDER, env).statistics["columns"]["humans"]
+    assert max(abs(value) for name in ("min", "max") for value in humans[name][2:4]) <= 1.2
+
+
 def test_pictures_are_those_of_the_manifests():
     listed = {}
     for env in ENVS:
@@ -132,14 +139,14 @@ def test_the_package_generates_what_the_card_describes(env, tmp_path):
     manifest = cards.read_published(FOLDER, env)
     words = shlex.split(manifest.command)
     assert words[:2] == ["navrep-data", "generate"]
-    words[words.index("--n") + 1] = "2"
+    words[words.index("--n") + 1] = "12"  # a rare case may first show in a later one
     with pytest.raises(SystemExit) as done:
         cli.run([*words[1:], "--out", str(tmp_path), "--workers", "1"])
     assert done.value.code == 0
     again = Manifest.read(tmp_path)
     if again.versions != manifest.versions:
         pytest.skip("other versions or another CPU: bytes are promised for those of the manifest")
-    assert again.shards[0].sequence_hashes == manifest.shards[0].sequence_hashes[:2]
+    assert again.shards[0].sequence_hashes == manifest.shards[0].sequence_hashes[:12]
 
 
 @pytest.mark.slow
