@@ -27,6 +27,10 @@ _ARCHITECTURES = {
     "transformer": "V and M trained as one: a variational autoencoder with a causal transformer of {blocks} blocks",
     "e2e": "one network from observation to action, no world model",
 }
+_BLIND_PEOPLE = (
+    "In the released training environment half of the people, drawn by chance, do not see the robot and walk as if it "
+    "was not there."
+)
 _INIT = re.compile(r"--init (\S+)")
 _FEATURES = {
     "z": "the code z of the current scan",
@@ -138,6 +142,7 @@ def quirks(r: Record) -> list[str]:
             if r.lidar == "1d"
             else "The nearest range cell is fed as measured; the encoders of the world models clear it."
         )
+    found.append(_BLIND_PEOPLE)
     return found
 
 

@@ -8,7 +8,7 @@ from navrep_data.zoo._markdown import table
 from navrep_data.zoo.measured import episodes, feeding, is_benchmark, played, share
 from navrep_data.zoo.names import RELEASED
 from navrep_data.zoo.registry import Record, dependants
-from navrep_data.zoo.stages import stages_table, supervision
+from navrep_data.zoo.stages import earlier_stages, stages_table, supervision
 
 FIRST_LINE = "Retrained by navrep-data; not the authors' checkpoint."
 _MACHINE = ("device", "processor", "cores", "threads", "torch")
@@ -16,7 +16,9 @@ _LOOKED = (
     "These episodes chose the weights. The recipe itself was changed after scores on both test suites had been seen: "
     "[docs/experiments.md](../../docs/experiments.md) lists who looked at which episodes when."
 )
-_BLIND_PEOPLE = "In its training worlds about half of the people do not see the robot and walk into it."
+_BLIND_PEOPLE = (
+    "In its training worlds half of the people, drawn by chance, do not see the robot and walk as if it was not there."
+)
 _BENCHMARK_HEAD = (
     "suite", "physics", "episodes (rounds)", "feeding", "success, contact-free (95 % interval)", "success, as released",
     "`goal` on the same episodes, both", "collision", "timeout", "contacts per km", "command",
@@ -88,7 +90,7 @@ def recipe(r: Record) -> str:
         facts.append(("validation", ", ".join(f"{key} {value:.4g}" for key, value in t["validation"].items())))
     commands = "\n".join(t["commands"])
     looked = f"\n\n{_LOOKED}" if r.kind == "policy" else ""
-    return f"```\n{commands}\n```\n\n{stages_table(r)}\n\n{table(('', ''), facts)}{looked}"
+    return f"```\n{commands}\n```\n\n{stages_table(r)}\n\n{earlier_stages(r)}{table(('', ''), facts)}{looked}"
 
 
 def _hours(seconds: float | None) -> str | None:

@@ -159,6 +159,27 @@ def stages_table(r: Record) -> str:
     )
 
 
+def earlier_stages(r: Record) -> str:
+    """Return what the checkpoint had learned that a training went on from, with a link to its card, as a paragraph.
+
+    Parameters
+    ----------
+    r : Record
+        Of a checkpoint that this project trained.
+
+    Returns
+    -------
+    str
+        Empty where it began from random weights, or from a folder whose stages the table has.
+    """
+    init = stages(r)[0].init
+    if init is None or init not in records():
+        return ""
+    steps = [stage.steps for stage in stages(records()[init])]
+    sums = f", {' + '.join(f'{n:,}' for n in steps)}" if len(steps) > 1 else ""
+    return f"[`{init}`]({init}.md) had been trained for {sum(steps):,} steps before{sums}: these come on top.\n\n"
+
+
 def _plain(value: Any) -> str:
     """Return a setting as in the command line; what did not exist yet is a dash."""
     return "-" if value is None else str(value).lower() if isinstance(value, bool) else f"{value:g}"
