@@ -130,6 +130,7 @@ def test_table_has_a_column_per_source_and_the_goal_beside(measured):
     assert "| transformer_rings_z | - | - | 40.0 % (" in text
     assert "| 20.0 % | 30.0 % |" in text
     assert "76 %" in text
+    assert "V was also trained with the true positions of people" in text
 
 
 AS_FED = {"ranges": "as_released", "scaling": "none"}
@@ -201,12 +202,18 @@ def test_training_curves(tmp_path):
         folder.mkdir(parents=True)
         lines = ["step,success,val_success", "50,0.5,", *(f"{100 * (i + 1)},,{r}" for i, r in enumerate(rates))]
         (folder / "log.csv").write_text("\n".join(lines) + "\n")
+    chosen = "ian, consistent physics, numpy seeds 5000 to 5099, by the share of goals without contact"
+    (tmp_path / "a_z" / "config.json").write_text(json.dumps({"metadata": {"selected_on": chosen}}))
     done = reproduce("fig-training", tmp_path)
     picture(done.file)
     logged = [s for s in done.sources if "log" in s["source"]]
     assert [(s["name"], s["best"], s["last"], s["steps"]) for s in logged] == [
         ("a_z", 0.4, 0.3, 300), ("deep/b_zh", 0.5, 0.5, 300),
     ]  # fmt: skip
+    said = {s["name"]: s["validation"] for s in done.sources}
+    assert said["a_z"] == "contact-free, on ian, consistent physics, numpy seeds 5000 to 5099"
+    assert said["deep/b_zh"] == "which goals count is not recorded"
+    assert said["transformer_rings_z.v1"] == "as released"
 
 
 @pytest.mark.slow

@@ -7,13 +7,17 @@ from typing import Any
 
 from navrep_data.evaluate.figures import PALETTE, new_figure
 from navrep_data.evaluate.reproduce.drawn import Drawn, Missing
+from navrep_data.io import read_json
 from navrep_data.io.logs import LOG_FILE, read_log
 from navrep_data.zoo import registry
 
 _MARKERS = "osD^vPX*"
+_MAX_BYTES = 1 << 20
+_USUAL = "navrep-test, original physics, numpy seeds 5000 to 5099"
 NOTE = (
-    "Validation: 100 episodes of navrep-test at its greatest difficulty, original physics, numpy seeds 5000 to 5099. "
-    "The authors released no curves."
+    f"Validation, where a name says nothing else: 100 episodes of {_USUAL}, at the greatest difficulty.\n"
+    "Contact-free: goals without touching anybody or anything; as released: all goals, one in the step of a contact, "
+    "too. The authors released no curves."
 )
 
 
@@ -26,17 +30,19 @@ def training(folder: Path) -> Drawn:
     figure = new_figure(7.6, 4.4)
     ax = figure.subplots()
     sources = []
-    for i, (name, (steps, success, shipped)) in enumerate(sorted(curves.items())):
+    for i, (name, (steps, success, shipped, selected_on)) in enumerate(sorted(curves.items())):
         colour = PALETTE[i % len(PALETTE)]
         best = max(success)
         marker = _MARKERS[i % len(_MARKERS)]
+        counted = _counted(selected_on)
         ax.plot(
             [s / 1e6 for s in steps], [100 * s for s in success], color=colour, linewidth=1.3, marker=marker,
-            markersize=3.5, markevery=max(1, len(steps) // 12), label=f"{name} (best {best:.0%})",
+            markersize=3.5, markevery=max(1, len(steps) // 12), label=f"{name} ({counted}; best {best:.0%})",
         )  # fmt: skip
         ax.axhline(100 * best, color=colour, linewidth=0.8, linestyle=":")
         source = "ours, shipped" if shipped else "ours, a training's log"
-        sources.append({"name": name, "source": source, "steps": steps[-1], "best": best, "last": success[-1]})
+        sources.append({"name": name, "source": source, "steps": steps[-1], "best": best, "last": success[-1],
+                        "validation": counted})  # fmt: skip
     ax.set_xlabel("million steps of all worlds")
     ax.set_ylabel("validation episodes that reach the goal [%]")
     ax.set_ylim(0, 100)
@@ -49,7 +55,28 @@ def training(folder: Path) -> Drawn:
     return Drawn(figure, sources=sources)
 
 
-Curve = tuple[list[int], list[float], bool]
+Curve = tuple[list[int], list[float], bool, str | None]
+"""Steps, shares, whether the weights are shipped, and on what they were chosen, None where that is not written down."""
+
+
+def _counted(selected_on: str | None) -> str:
+    """Return which success a curve shows, and on what where that is not the usual."""
+    if selected_on is None:
+        return "which goals count is not recorded"
+    where, _, rule = selected_on.partition(", by the share of ")
+    success = "contact-free" if "without contact" in rule else "as released"
+    return success if where == _USUAL else f"{success}, on {where}"
+
+
+def _selected_on(training: Path) -> str | None:
+    """Return on what a training's best weights were chosen, from the checkpoint that it keeps."""
+    path = training / "config.json"
+    if not path.is_file():
+        return None
+    config = read_json(path, _MAX_BYTES)
+    metadata = config.get("metadata") if isinstance(config, dict) else None
+    found = metadata.get("selected_on") if isinstance(metadata, dict) else None
+    return found if isinstance(found, str) else None
 
 
 def _recorded() -> dict[str, Curve]:
@@ -57,7 +84,8 @@ def _recorded() -> dict[str, Curve]:
     for r in registry.records().values():
         points: Any = (r.training or {}).get("curve")
         if points:
-            found[r.name] = ([int(p[0]) for p in points], [float(p[1]) for p in points], True)
+            steps, shares = [int(p[0]) for p in points], [float(p[1]) for p in points]
+            found[r.name] = (steps, shares, True, (r.training or {}).get("selected_on"))
     return found
 
 
@@ -67,5 +95,6 @@ def _logged(folder: Path) -> dict[str, Curve]:
         points = [(int(r["step"]), float(r["val_success"])) for r in read_log(path.parent) if "val_success" in r]
         if points:
             name = path.parent.relative_to(folder).as_posix()
-            found[folder.name if name == "." else name] = ([p[0] for p in points], [p[1] for p in points], False)
+            curve = [p[0] for p in points], [p[1] for p in points], False, _selected_on(path.parent)
+            found[folder.name if name == "." else name] = curve
     return found
