@@ -52,3 +52,11 @@ def test_a_controller_names_the_world_model_and_its_supervision():
     assert "`joint_1d.v1`, whose V was trained with true positions of people" in text
     assert "These episodes chose the weights." in text
     assert "not looked at" not in text
+
+
+def test_a_card_says_what_its_start_had_learned():
+    found = registry.records()
+    text = stages.earlier_stages(found["modular_1d_z.v1"])
+    assert "22,500,000 steps before, 5,000,000 + 7,500,000 + 10,000,000" in text
+    assert stages.earlier_stages(found["transformer_rings_z.v1"]) == ""
+    assert stages.earlier_stages(found["e2e_1d.v1"]) == ""
