@@ -41,7 +41,7 @@ class Metric:
 METRICS: tuple[Metric, ...] = (
     Metric("time_to_goal", "s", "steps x time step, of the episodes that reached the goal", successes_only=True),
     Metric("path_length", "m", "sum of the distances between the robot's positions one step apart"),
-    Metric("spl", "", "success weighted by path length: success x shortest / max(shortest, path length)"),
+    Metric("spl", "", "success as released, weighted by path length: success x shortest / max(shortest, path length)"),
     Metric(
         "min_clearance",
         "m",
