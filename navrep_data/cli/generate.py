@@ -37,7 +37,8 @@ def generate_command(
         str | None,
         typer.Option(
             "--physics",
-            help="consistent (one geometry), or original (as NavRep was released).",
+            help="consistent (one geometry for obstacles; people are seen as legs and, off maps, hit as discs of "
+            "0.3 to 0.5 m), or original (as NavRep was released).",
             show_default="consistent",
         ),
     ] = None,
