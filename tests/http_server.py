@@ -35,7 +35,7 @@ class Site:
 
 def _handler(site: Site) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
-        timeout = 20
+        timeout = 300
 
         def log_message(self, *_):
             pass

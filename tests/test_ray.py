@@ -2,6 +2,7 @@
 
 import hashlib
 import importlib.util
+import json
 import os
 import signal
 import subprocess
@@ -36,12 +37,11 @@ NOTICE = {
     "health_check_failure_threshold": 4,
 }
 PATIENT = "pilots_for_tests:patient"
-"""A policy that takes its time in the cluster's workers, and only there, so that there is a middle to kill in."""
+"""A policy that waits for its turn in the cluster's workers, and only there, so that there is a middle to kill in."""
 DATA = {"n": 24, "length": 40, "humans": 4, "obstacles": 3, "shard_size": 2, "seed": 5, "policy": PATIENT}
 DATA["policy_batch"] = 2
+RESULTS = "navreptest-original/pilots_for_tests-patient.json"
 
-# a cluster that hangs must not take the whole suite's time
-pytestmark = pytest.mark.timeout(240)
 slow = pytest.mark.slow
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs navrep-data[ray]")
 needs_proc = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc to find worker processes")
@@ -58,25 +58,41 @@ def tree(root):
 class Nodes:
     """A cluster on this machine: a head without processors, and nodes with one each."""
 
-    def __init__(self):
+    def __init__(self, turnstile):
+        self.turnstile, self.cluster = turnstile, None
+        self.fill()
+
+    def fill(self):
+        """Have two living nodes; Ray gives each 30 s to start, which a busy machine may exceed: then all start anew."""
+        for left in (2, 1, 0):
+            try:
+                if self.cluster is None:
+                    self._begin()
+                self._fill()
+                return
+            except Exception:
+                self.shutdown()
+                if not left:
+                    raise
+
+    def _begin(self):
         from ray.cluster_utils import Cluster
 
-        head = {"num_cpus": 0, "include_dashboard": False, "_system_config": NOTICE, **HERE}
-        self.cluster = Cluster(initialize_head=True, head_node_args=head)
         self.nodes, self.dead = [], []
+        self.cluster = Cluster()
+        self.cluster.add_node(wait=False, num_cpus=0, include_dashboard=False, _system_config=NOTICE, **HERE)
         self.address = self.cluster.address
-        try:
-            self.fill()
-        except BaseException:
-            self.shutdown()
-            raise
 
-    def fill(self, count=2):
+    def _fill(self):
         while self.dead:  # the helper counts them among its nodes until it is told
             self.cluster.remove_node(self.dead.pop(), allow_graceful=False)
-        while len(self.nodes) < count:
-            self.nodes.append(self.cluster.add_node(num_cpus=1, **HERE))
-        self.cluster.wait_for_nodes(timeout=60)
+        os.environ["TURNSTILE"] = str(self.turnstile)  # the nodes' workers inherit it
+        try:
+            while len(self.nodes) < 2:
+                self.nodes.append(self.cluster.add_node(wait=False, num_cpus=1, **HERE))
+        finally:
+            del os.environ["TURNSTILE"]
+        self.cluster.wait_for_nodes(timeout=300)
 
     @staticmethod
     def raylet(node):
@@ -111,18 +127,24 @@ class Nodes:
         return node
 
     def shutdown(self):
-        self.cluster.shutdown()
+        if self.cluster is not None:
+            self.cluster.shutdown()
+            self.cluster = None
 
 
 @pytest.fixture(scope="module")
-def nodes():
-    before = {name: os.environ.get(name) for name in ("PYTHONPATH", "PATIENCE", "RAY_ADDRESS")}
+def turnstile(tmp_path_factory):
+    return tmp_path_factory.mktemp("turnstile")
+
+
+@pytest.fixture(scope="module")
+def nodes(turnstile):
+    before = {name: os.environ.get(name) for name in ("PYTHONPATH", "TURNSTILE", "RAY_ADDRESS")}
     paths = [str(TESTS / "evaluate"), str(TESTS), str(TESTS.parent), *filter(None, [before["PYTHONPATH"]])]
     os.environ.pop("RAY_ADDRESS", None)
-    os.environ |= {"PYTHONPATH": os.pathsep.join(paths), "PATIENCE": "0.01"}  # what the nodes' workers inherit
+    os.environ["PYTHONPATH"] = os.pathsep.join(paths)
     sys.path.insert(0, str(TESTS / "evaluate"))
-    started = Nodes()
-    os.environ["PATIENCE"] = "0"
+    started = Nodes(turnstile)
     yield started
     started.shutdown()
     sys.path.remove(str(TESTS / "evaluate"))
@@ -133,39 +155,72 @@ def nodes():
 
 
 class Killer(threading.Thread):
-    """Kills a worker of one node once something is finished, and the other node a little later."""
+    """Kills a worker of one node once something is finished, and the other node once more is.
 
-    def __init__(self, nodes, finished):
+    Nothing of it is a race: the policy in the cluster waits for its turn at every call, and a kill comes while both
+    nodes wait. Each portion of calls is so large that two workers cannot use it up without finishing a task, and both
+    together are so small that work is left.
+
+    Parameters
+    ----------
+    nodes : Nodes
+        Two of them.
+    turnstile : Path
+        The folder where the policy asks.
+    longest : int
+        The most calls of the policy that a task takes.
+    finished : callable
+        Returns how much the driver has finished.
+    """
+
+    def __init__(self, nodes, turnstile, longest, finished):
         super().__init__(daemon=True)
-        self.nodes, self.finished = nodes, finished
+        self.nodes, self.turnstile, self.longest, self.finished = nodes, turnstile, longest, finished
         self.worker, self.node, self.at = None, None, []
+        (turnstile / "calls").write_bytes(b"")
+        self._allow(0)
 
     def run(self):
-        deadline = time.monotonic() + 200
-        self._wait(1, deadline)
+        deadline = time.monotonic() + 1000
         first, second = self.nodes.nodes
-        self.worker = self.nodes.kill_worker(first, deadline)
-        self.at.append(self.finished())
-        self._wait(self.at[0] + 1, deadline)
-        self.node = self.nodes.kill_node(second)
-        self.at.append(self.finished())
+        try:
+            self._finish(1, deadline)
+            self.worker = self.nodes.kill_worker(first, deadline)
+            self.at.append(self.finished())
+            self._finish(self.at[0] + 1, deadline)
+            self.node = self.nodes.kill_node(second)
+            self.at.append(self.finished())
+        finally:
+            (self.turnstile / "allowed").unlink()
 
-    def _wait(self, count, deadline):
-        while self.finished() < count and time.monotonic() < deadline:
+    def _allow(self, calls):
+        new = self.turnstile / "allowed.new"
+        new.write_text(str(calls))
+        new.replace(self.turnstile / "allowed")
+
+    def _calls(self):
+        return (self.turnstile / "calls").stat().st_size
+
+    def _finish(self, count, deadline):
+        """Let calls pass until so much is finished and both nodes wait for more."""
+        # those that wait have their numbers already, and so has the worker that was killed
+        allowed = self._calls() + 2 * self.longest + 1
+        self._allow(allowed)
+        while (self.finished() < count or self._calls() < allowed + 2) and time.monotonic() < deadline:
             time.sleep(0.01)
 
 
 @slow
 @needs_ray
 @needs_proc
-def test_a_dataset_survives_a_killed_worker_and_a_killed_node(nodes, tmp_path):
+def test_a_dataset_survives_a_killed_worker_and_a_killed_node(nodes, turnstile, tmp_path):
     nodes.fill()
     generate(out=tmp_path / "here", **DATA)
     root = tmp_path / "there"
-    killer = Killer(nodes, lambda: len(list(root.glob("data/shard-*.h5"))))
+    killer = Killer(nodes, turnstile, DATA["length"], lambda: len(list(root.glob("data/shard-*.h5"))))
     killer.start()
     result = generate(out=root, executor="ray", address=nodes.address, **DATA)
-    killer.join(10)
+    killer.join()
     assert killer.worker is not None
     assert killer.node is not None
     assert 1 <= killer.at[0] < killer.at[1] < 12, "the kills were not in the middle"
@@ -177,7 +232,7 @@ def test_a_dataset_survives_a_killed_worker_and_a_killed_node(nodes, tmp_path):
 @slow
 @needs_ray
 @needs_proc
-def test_a_benchmark_survives_a_killed_worker_and_a_killed_node(nodes, tmp_path):
+def test_a_benchmark_survives_a_killed_worker_and_a_killed_node(nodes, turnstile, tmp_path):
     nodes.fill()
     here = benchmark([PATIENT], episodes=64, out=tmp_path / "here", figures=False)
     done = [0]
@@ -185,13 +240,14 @@ def test_a_benchmark_survives_a_killed_worker_and_a_killed_node(nodes, tmp_path)
     def watch(name, count, total):
         done[0] = count if name == PATIENT else 0
 
-    killer = Killer(nodes, lambda: done[0])
+    longest = max(json.loads((tmp_path / "here" / RESULTS).read_text())["episodes"]["steps"])
+    killer = Killer(nodes, turnstile, longest, lambda: done[0])
     killer.start()
     there = benchmark(
         [PATIENT], episodes=64, out=tmp_path / "there", figures=False, executor="ray", address=nodes.address,
         progress=watch,
     )  # fmt: skip
-    killer.join(10)
+    killer.join()
     assert killer.worker is not None
     assert killer.node is not None
     assert 1 <= killer.at[0] < killer.at[1] < 64, "the kills were not in the middle"

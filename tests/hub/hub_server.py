@@ -121,7 +121,7 @@ class _RefusedError(Exception):
 
 class _Handler(BaseHTTPRequestHandler):
     hub: LoopbackHub
-    timeout = 20
+    timeout = 300
 
     def log_message(self, *_: Any) -> None:
         pass

@@ -126,13 +126,13 @@ def test_a_revision_is_what_it_was(hub, pushed, template, revision):
             Fault("cut", SHARD, "GET", times=4, at=5000),
             Fault("flip", SHARD, "GET", times=1),
             Fault("status", SHARD, "GET", times=2, status=429, headers={"Retry-After": "3"}),
-            Fault("stall", SHARD, "GET", times=1, seconds=5),
+            Fault("stall", SHARD, "GET", times=1, seconds=600),
         ],
         1,
     ),
     ids=lambda f: f.kind,
 )
-def test_opening_goes_on_after_a_failure(hub, pushed, template, cls, fault):
+def test_opening_goes_on_after_a_failure(hub, pushed, template, impatient, cls, fault):
     hub.faults = [dataclasses.replace(fault)]
     options = {"window": 8, "fields": ["sequence", "step"]}
     there = cls.from_hub(REPO, "1d", **options)

@@ -384,17 +384,16 @@ def test_a_server_that_stays_busy(hub, pushed, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", few([r"/api/datasets", r"/tree/", r"/resolve/", LARGE], 1))
-def test_a_server_that_stalls_once(hub, pushed, template, tmp_path, path):
-    hub.faults = [Fault("stall", path, times=1, seconds=5)]
+def test_a_server_that_stalls_once(hub, pushed, template, tmp_path, impatient, path):
+    hub.faults = [Fault("stall", path, times=1, seconds=600)]
     check_whole(pull(REPO, tmp_path / "got").root, template)
+    assert hub.faults[0].times == 0
 
 
 @pytest.mark.slow
-def test_a_server_that_stalls_for_good(hub, pushed, tmp_path, monkeypatch):
-    for name in ("HF_HUB_DOWNLOAD_TIMEOUT", "HF_HUB_ETAG_TIMEOUT"):
-        monkeypatch.setattr(constants, name, 0.05)
-    monkeypatch.setattr(_hub_client, "SILENCE", 0.05)
-    hub.faults = [Fault("stall", r"^/api/datasets", times=1000, seconds=1)]
+@pytest.mark.parametrize("impatient", [0.05], indirect=True)
+def test_a_server_that_stalls_for_good(hub, pushed, tmp_path, impatient):
+    hub.faults = [Fault("stall", r"^/api/datasets", times=1000, seconds=600)]
     with pytest.raises(HubError, match=r"Gave up after 5 attempts to find dataset user/crowd .*: the Hub is silent"):
         pull(REPO, tmp_path / "got")
 
@@ -568,14 +567,14 @@ def test_a_server_that_sends_without_end(hub, pushed, tmp_path, monkeypatch):
             Fault("status", r"/commit/", "POST", times=2, status=503),
             Fault("cut", r"/commit/", "POST", times=1, at=10),
             Fault("status", r"/repos/create", "POST", times=1, status=429, headers={"Retry-After": "1"}),
-            Fault("stall", r"/commit/", "POST", times=1, seconds=5),
-            Fault("stall", r"^/lfs/", "PUT", times=1, seconds=5),
+            Fault("stall", r"/commit/", "POST", times=1, seconds=600),
+            Fault("stall", r"^/lfs/", "PUT", times=1, seconds=600),
         ],
         2,
     ),
     ids=lambda f: f"{f.kind}-{f.path.strip('/^$')}-{f.at or f.status}",
 )
-def test_push_goes_on_after_a_failure(hub, template, tmp_path, fault):
+def test_push_goes_on_after_a_failure(hub, template, tmp_path, impatient, fault):
     hub.faults = [dataclasses.replace(fault)]
     pushed = push(template, REPO, license="mit")
     assert hub.faults[0].times == 0
@@ -732,11 +731,10 @@ def test_cli_of_models(command, hub, tmp_path):
     assert repo.files("v2")["model.safetensors"] == (tmp_path / "m" / "model.safetensors").read_bytes()
 
 
-def wait_for(condition, seconds=60):
-    deadline = time.monotonic() + seconds
-    while not condition() and time.monotonic() < deadline:
+def wait_for(condition):
+    """However long that takes; pytest's own limit ends a hang."""
+    while not condition():
         time.sleep(0.02)
-    assert condition()
 
 
 def interrupt(running, stall, how):
@@ -754,7 +752,7 @@ def interrupt(running, stall, how):
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 @pytest.mark.parametrize("after", [0, 3, 5])
 def test_a_killed_push_goes_on(command, hub, template, tmp_path, how, after):
-    hub.faults = [stall := Fault("stall", r"^/lfs/[0-9a-f]*$", "PUT", times=1000, after=after, seconds=60)]
+    hub.faults = [stall := Fault("stall", r"^/lfs/[0-9a-f]*$", "PUT", times=1000, after=after, seconds=600)]
     running = command("push", template, REPO, "--license", "mit", wait=False)
     wait_for(lambda: len(hub.uploads) == after and stall.times < 1000)
     done = interrupt(running, stall, how)
@@ -773,7 +771,7 @@ def test_a_killed_push_goes_on(command, hub, template, tmp_path, how, after):
 @pytest.mark.parametrize("after", [0, 3, 5])
 def test_a_killed_pull_goes_on(command, hub, pushed, template, tmp_path, how, after):
     root = tmp_path / "got"
-    hub.faults = [stall := Fault("stall", LARGE, "GET", times=1000, after=after, seconds=60)]
+    hub.faults = [stall := Fault("stall", LARGE, "GET", times=1000, after=after, seconds=600)]
     running = command("pull", REPO, "--out", root, wait=False)
     wait_for(lambda: stall.times < 1000)
     interrupt(running, stall, how)

@@ -33,7 +33,7 @@ def site():
 
 
 def get(site, folder, expected=RIGHT, **options):
-    options = {"timeout": 5.0, "attempts": 3, "backoff": 0.0, "progress": False, **options}
+    options = {"timeout": 60.0, "attempts": 3, "backoff": 0.0, "progress": False, **options}
     return download(f"{site.url}/a.bin", folder / "deep" / "a.bin", expected, **options)
 
 
@@ -237,7 +237,7 @@ def test_two_at_once_download_once(site, tmp_path):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(timeout=20)
+        thread.join(timeout=300)
     assert results == [DATA] * 4
     assert len(site.seen) == 1
 

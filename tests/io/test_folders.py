@@ -84,7 +84,7 @@ def test_killed_while_it_is_filled_it_holds_no_dataset(tmp_path, after):
         "    for name in names:\n"
         "        (part / name).mkdir() if '.' not in name else (part / name).write_text('{}')\n"
     )
-    assert subprocess.run([sys.executable, "-c", program], cwd=tmp_path, timeout=60).returncode == 9
+    assert subprocess.run([sys.executable, "-c", program], cwd=tmp_path, timeout=300).returncode == 9
     with pytest.raises(DatasetNotFoundError):
         Manifest.read(tmp_path)
     with pytest.raises(FolderInUseError, match=r"\.part exists, left by a test that was interrupted"):

@@ -168,11 +168,13 @@ def test_shards_may_come_in_any_order_with_gaps_until_complete(dataset):
 @pytest.mark.slow
 def test_second_writer_is_refused_and_a_killed_one_is_not(dataset):
     code = (
-        "import sys, time\nfrom navrep_data.shards import writer_lock\n"
-        "with writer_lock(sys.argv[1]):\n    print('held', flush=True)\n    time.sleep(60)"
+        "import sys\nfrom navrep_data.shards import writer_lock\n"
+        "with writer_lock(sys.argv[1]):\n    print('held', flush=True)\n    sys.stdin.read()"
     )
     root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    process = subprocess.Popen([sys.executable, "-c", code, str(dataset)], stdout=subprocess.PIPE, cwd=root)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(dataset)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=root
+    )
     try:
         assert process.stdout.readline() == b"held\n"
         with pytest.raises(DatasetLockedError, match="one writer at a time"), writer_lock(dataset):
