@@ -10,6 +10,8 @@ from torch.utils.data import BatchSampler, DataLoader, RandomSampler, Sequential
 from navrep_data.datasets._windows import WindowDataset
 from navrep_data.errors import check_whole
 
+_MAX_SEED = 2**64 - 1  # of torch's generators
+
 
 def make_loader(
     dataset: WindowDataset,
@@ -32,7 +34,7 @@ def make_loader(
     shuffle : bool
         Whether the order is random, a new one each epoch.
     seed : int
-        Start of that randomness.
+        Start of that randomness, from 0 to 2^64 - 1.
     drop_last : bool
         Whether to leave out a smaller last batch.
     num_workers : int
@@ -49,12 +51,13 @@ def make_loader(
     Raises
     ------
     ConfigError
-        If the batch size is not at least 1.
+        If `batch_size`, `seed` or `num_workers` is no whole number, or out of range.
     """
-    size = check_whole("batch_size", batch_size, 1)
+    size, workers = check_whole("batch_size", batch_size, 1), check_whole("num_workers", num_workers, 0)
+    seed = check_whole("seed", seed, 0, _MAX_SEED)
     generator = torch.Generator(device="cpu").manual_seed(seed)
     order: Any = RandomSampler(dataset, generator=generator) if shuffle else SequentialSampler(dataset)
     batches = BatchSampler(order, size, drop_last)
     # which workers are seeded from; by default it draws from the global one
     options.setdefault("generator", torch.Generator(device="cpu").manual_seed(seed))
-    return DataLoader(dataset, batch_size=None, sampler=batches, num_workers=num_workers, **options)
+    return DataLoader(dataset, batch_size=None, sampler=batches, num_workers=workers, **options)

@@ -20,7 +20,7 @@ from navrep_data.datasets._bag import NO_TOPIC, Bag
 from navrep_data.datasets._bag_scans import Adapters
 from navrep_data.datasets._bag_types import Reading, Topics, Tracks
 from navrep_data.datasets.npz import MAX_ROWS_PER_SHARD, MAX_SEQUENCES_PER_SHARD, align
-from navrep_data.errors import ConfigError, DatasetError
+from navrep_data.errors import ConfigError, DatasetError, check_whole
 from navrep_data.io import new_folder, sha256_bytes, sha256_file
 from navrep_data.observations import scan_to_rings
 from navrep_data.observations.blind import declaration, runs_of
@@ -164,7 +164,8 @@ def import_rosbag(
     """
     paths = [Path(source)] if isinstance(source, str | os.PathLike) else [Path(item) for item in source]
     reach, range_max = range_max, RANGE_MAX if range_max is None else range_max
-    _check(paths, dt, length, range_max, mount, goal_radius)
+    _check(paths, dt, range_max, mount, goal_radius)
+    length = check_whole("length", length, 2, MAX_LENGTH)
     reading = Reading(mount, reach, invalid_is_free, assume_same_frame)
     say = _print if note is None else note
     recordings = []
@@ -228,15 +229,11 @@ def near_zero(
     return [replace(r, pieces=[replace(p, pose=p.pose - shift) for p in r.pieces]) for r in recordings], (x, y)
 
 
-def _check(
-    paths: Sequence[Path], dt: float, length: int, range_max: float, mount: Sequence[float], radius: float
-) -> None:
+def _check(paths: Sequence[Path], dt: float, range_max: float, mount: Sequence[float], radius: float) -> None:
     if not paths:
         raise ConfigError("No bag was given; expected ROS 1 .bag files or folders of ROS 2 bags.")
     if not all(math.isfinite(v) and v > 0 for v in (dt, range_max, radius)):
         raise ConfigError(f"dt is {dt} s, range_max {range_max} m, goal_radius {radius} m; expected positive numbers.")
-    if not 2 <= length <= MAX_LENGTH:
-        raise ConfigError(f"length is {length}; expected 2 to {MAX_LENGTH:,} rows.")
     if len(mount) != 3:
         raise ConfigError(f"mount has {len(mount)} numbers; expected x, y [m] and yaw [rad] of the scanner.")
 

@@ -28,7 +28,7 @@ from navrep_data.datasets._windows import (
     make_spec,
     open_folder,
 )
-from navrep_data.errors import ConfigError
+from navrep_data.errors import ConfigError, check_whole
 
 # Windows converted at a time when handing out single ones.
 _CONVERT = 32
@@ -48,9 +48,8 @@ def _rank_and_world(rank: int | None, world_size: int | None) -> tuple[int, int]
                     f"RANK is {given[0]!r} and WORLD_SIZE {given[1]!r} in the environment, expected numbers."
                 )
             rank, world_size = int(given[0]), int(given[1])
-    if not 0 <= rank < world_size:
-        raise ConfigError(f"rank is {rank} of {world_size}, expected 0 <= rank < world_size.")
-    return rank, world_size
+    world_size = check_whole("world_size", world_size, 1)
+    return check_whole("rank", rank, 0, world_size - 1), world_size
 
 
 def _share(first: int, stop: int, part: int, parts: int) -> tuple[int, int]:
@@ -128,7 +127,7 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         self.batch_size = None if batch_size is None else check_rows("batch_size", batch_size)
         self.buffer_sequences = check_rows("buffer_sequences", buffer_sequences)
         self.shuffle = bool(shuffle)
-        self.seed = int(seed)
+        self.seed = check_whole("seed", seed, 0)
         self.rank, self.world_size = _rank_and_world(rank, world_size)
         self._folder = open_folder(root)
         self.spec = make_spec(
@@ -214,7 +213,8 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the order of the next epoch; forget a position to resume from if it is in another one."""
-        self._epoch[0] = int(epoch)
+        epoch = check_whole("epoch", epoch, 0)
+        self._epoch[0] = epoch
         if self._resume is not None and self._resume["epoch"] != epoch:
             self._resume = None
         self._position = 0
@@ -379,7 +379,7 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
         Raises
         ------
         ConfigError
-            If `batches` is negative, or given without any batch size.
+            If a number is no whole one or out of range, or `batches` is given without any batch size.
         """
         if batches is None:
             worker, workers = self._worker
@@ -388,17 +388,16 @@ class StreamingSequenceDataset(IterableDataset[Batch]):
             if self._position == 0 and self._resume is not None:
                 positions, next_worker = list(self._resume["positions"]), self._resume["next_worker"]
         else:
-            positions, next_worker = self._count(batches, max(num_workers, 1), batch_size or self.batch_size)
+            size = self.batch_size if batch_size is None else check_rows("batch_size", batch_size)
+            if size is None:
+                raise ConfigError("batches is given without batch_size, expected both: give the DataLoader's.")
+            workers = max(check_whole("num_workers", num_workers, 0), 1)
+            positions, next_worker = self._count(check_whole("batches", batches, 0), workers, size)
         state = {"positions": positions, "workers": len(positions), "next_worker": next_worker}
         return {"version": 1, "epoch": self.epoch, **self._identity(), **state}
 
-    def _count(self, batches: int, workers: int, batch_size: int | None) -> tuple[list[int], int]:
+    def _count(self, batches: int, workers: int, batch_size: int) -> tuple[list[int], int]:
         """Return the positions of all workers after `batches` batches, and which one comes next."""
-        if batch_size is None or batches < 0:
-            raise ConfigError(
-                f"batches is {batches} and batch_size {batch_size}, "
-                "expected batches >= 0 and the DataLoader's batch_size."
-            )
         positions, worker = [0] * workers, 0
         if self._resume is not None and self._resume["workers"] == workers:
             positions, worker = list(self._resume["positions"]), self._resume["next_worker"]

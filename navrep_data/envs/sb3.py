@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -11,9 +12,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from navrep_data.envs.vector import NavRepVectorEnv
 from navrep_data.envs.wrappers import VectorFlatObservation, VectorRingsObservation, VectorScan1dObservation
-from navrep_data.errors import ConfigError
+from navrep_data.errors import ConfigError, check_whole, whole_number
 from navrep_data.schema import Event
 from navrep_data.sim import SimConfig, WorldState
+from navrep_data.sim.simulator import check_seed
 
 LIDARS = {None: None, "scan": None, "rings": VectorRingsObservation, "1d": VectorScan1dObservation}
 
@@ -88,8 +90,18 @@ class WorldBatch(VecEnv):
         """Return a copy of a world's state."""
         raise ConfigError("These worlds do not show their states: make them by navrep_data.envs.make_sb3_vec.")
 
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Let world i start its next episode with ``seed + i``; without a seed, anywhere."""
+        return super().seed(None if seed is None else check_seed(seed))
+
     def _chosen(self, indices: Any) -> list[World]:
-        return [self.worlds[i] for i in self._get_indices(indices)]
+        one = whole_number(indices)
+        n, chosen = self.num_envs, self._get_indices(indices if one is None else one)
+        try:
+            asked: list[Any] = list(chosen)
+        except TypeError:  # no number and no list of them
+            asked = [chosen]
+        return [self.worlds[check_whole("indices", i, -n, n - 1)] for i in asked]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of each of the worlds asked for; AttributeError where there is none."""

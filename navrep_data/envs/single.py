@@ -141,6 +141,7 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         SimulationError
             If a world could not be drawn.
         """
+        seed = None if seed is None else self._worlds.check_seed(seed)  # gymnasium takes Python's integers only
         super().reset(seed=seed)
         self._running = False
         self._worlds.choose([seed], options, self.np_random)

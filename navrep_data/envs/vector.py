@@ -23,7 +23,7 @@ from navrep_data.envs.worlds import (
     observation_space,
     with_length,
 )
-from navrep_data.errors import ConfigError, check_whole, did_you_mean
+from navrep_data.errors import ConfigError, check_whole, did_you_mean, whole_number
 from navrep_data.schema import Event
 from navrep_data.sim import SimConfig, WorldState
 from navrep_data.sim.raster import Camera, draw_frame
@@ -105,7 +105,7 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         **changes: Any,
     ) -> None:
         self.config = make_env_config(env, physics=physics, **changes)
-        self.num_envs = num_envs
+        self.num_envs = num_envs = check_whole("num_envs", num_envs, 1)
         self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         fps = max(1, round(1.0 / self.config.sensor.dt))
@@ -159,7 +159,8 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         SimulationError
             If a world could not be drawn.
         """
-        seeds = self._seeds(seed)
+        # gymnasium takes Python's integers only
+        seeds = [None if s is None else self._worlds.check_seed(s) for s in self._seeds(seed)]
         super().reset(seed=next((s for s in seeds if s is not None), None))
         self._worlds.choose(seeds, options, self.np_random)
         mask = self._reset_mask(options)
@@ -169,14 +170,19 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         self._restart(mask)
         return self._observe(), self._infos(np.ones(self.num_envs, np.bool_))
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[Any]:
         if seed is None:
             return [None] * self.num_envs
-        if isinstance(seed, (int, np.integer)):
-            return [int(seed) + i for i in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ConfigError(f"{len(seed)} seeds were given, expected one number or {self.num_envs} of them.")
-        return list(seed)
+        first = whole_number(seed)
+        if first is not None:
+            return [first + i for i in range(self.num_envs)]
+        try:
+            seeds = list(seed)  # type: ignore[arg-type]
+        except TypeError:  # no number and no list of them
+            raise ConfigError(f"seed is {seed!r}, expected one whole number or {self.num_envs} of them.") from None
+        if len(seeds) != self.num_envs:
+            raise ConfigError(f"{len(seeds)} seeds were given, expected one number or {self.num_envs} of them.")
+        return seeds
 
     def _reset_mask(self, options: dict[str, Any] | None) -> Mask:
         given = (options or {}).get("reset_mask")
@@ -314,6 +320,7 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         """
         if not self._running:
             raise gymnasium.error.ResetNeeded("There is nothing to draw before the first reset().")
+        world = self._number(world)
         state, grid = self._worlds.sim.state(world), self._worlds.grid(world)
         if self._scans is not None:
             scan = self._scans[world]
@@ -327,4 +334,7 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
 
     def state(self, world: int) -> WorldState:
         """Return a copy of one world's state, see :class:`navrep_data.sim.WorldState`."""
-        return self._worlds.sim.state(world)
+        return self._worlds.sim.state(self._number(world))
+
+    def _number(self, world: object) -> int:
+        return check_whole("world", world, -self.num_envs, self.num_envs - 1) % self.num_envs

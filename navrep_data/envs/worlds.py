@@ -106,6 +106,7 @@ class Worlds:
         self.n = n
         self._scenarios = len(config.scenarios)
         self.numbered = self._scenarios > 0 or _has_numbers(config.env)
+        self._most = MAX_NUMPY_SEED if self.numbered else MAX_SEED  # the largest seed
         first = 0 if episode is None else self._number(episode)
         self.sim = Simulator(config, n)
         self._lead = lead(config)
@@ -127,6 +128,10 @@ class Worlds:
         numpy_seed(self.config.env, episode)  # checks both
         return int(episode)
 
+    def check_seed(self, seed: object) -> int:
+        """Return a seed that names an episode or a stream of these worlds as an int, or refuse it."""
+        return check_whole("seed", seed, 0, self._most)
+
     def choose(
         self, seeds: Sequence[int | None], options: Mapping[str, Any] | None, random: np.random.Generator
     ) -> None:
@@ -135,7 +140,8 @@ class Worlds:
         Parameters
         ----------
         seeds : sequence of int or None, one per world
-            numpy seeds in environments with numbered episodes, streams in the others; None = go on.
+            From :meth:`check_seed`: numpy seeds in environments with numbered episodes, streams in the others; None =
+            go on.
         options : mapping, optional
             ``{"episode": k}``: world i plays number k + i; ``{"start": ..., "goal": ...}``: see :meth:`restart`.
         random : numpy.random.Generator
@@ -156,13 +162,12 @@ class Worlds:
             return
         given = np.array([seed is not None for seed in seeds])
         fresh = self._fresh & ~given
-        most = MAX_NUMPY_SEED if self.numbered else MAX_SEED
         keys = np.zeros(self.n, np.int64)
         for i, seed in enumerate(seeds):
             if seed is not None:
-                keys[i] = check_whole("seed", seed, 0, most)
+                keys[i] = seed
         if fresh.any():
-            keys[fresh] = random.integers(0, most, int(fresh.sum()))
+            keys[fresh] = random.integers(0, self._most, int(fresh.sum()))
         chosen = given | fresh
         self._fresh[chosen] = False
         if self.numbered:

@@ -207,8 +207,7 @@ class Simulator:
     """
 
     def __init__(self, config: SimConfig, n_worlds: int = 1, seed: int = 0, first_sequence: int = 0) -> None:
-        if n_worlds < 1:
-            raise ConfigError(f"n_worlds is {n_worlds!r}, expected at least 1.")
+        n_worlds = check_whole("n_worlds", n_worlds, 1)
         self.config = config
         self.n_worlds = n_worlds
         self.maps = MapWorlds(config, n_worlds) if config.world == "map" else None

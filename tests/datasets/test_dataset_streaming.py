@@ -232,7 +232,7 @@ def test_a_state_of_something_else_is_refused(root):
         next(iter(dataset))
     with pytest.raises(ConfigError, match="expected one per worker"):
         dataset.load_state_dict({**state, "positions": [1]})
-    with pytest.raises(ConfigError, match="expected batches >= 0 and the DataLoader's batch_size"):
+    with pytest.raises(ConfigError, match="batches is given without batch_size, expected both"):
         dataset.state_dict(3, num_workers=2)
 
 
@@ -248,7 +248,7 @@ def test_rank_comes_from_the_environment_or_torch(root, monkeypatch):
     assert (dataset.rank, dataset.world_size) == (1, 3)
     with pytest.raises(ConfigError, match="expected both or neither"):
         stream(root, rank=None)
-    with pytest.raises(ConfigError, match="rank is 2 of 2"):
+    with pytest.raises(ConfigError, match="rank is 2, expected a whole number from 0 to 1"):
         stream(root, rank=2, world_size=2)
     monkeypatch.undo()
     monkeypatch.setenv("RANK", "first")
@@ -266,3 +266,19 @@ def test_nothing_stays_open(root):
     assert len(os.listdir("/proc/self/fd")) - before <= shared
     del dataset
     assert len(os.listdir("/proc/self/fd")) == before
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.array, torch.tensor])
+def test_whole_numbers_of_any_kind(root, kind):
+    plain = stream(root, seed=3, rank=1, world_size=2)
+    other = stream(root, seed=kind(3), rank=kind(1), world_size=kind(2))
+    other.set_epoch(kind(0))
+    assert ids(other) == ids(plain)
+    state = other.state_dict(kind(1), num_workers=kind(2), batch_size=kind(3))
+    assert json.loads(json.dumps(state)) == plain.state_dict(1, num_workers=2, batch_size=3)
+
+
+@pytest.mark.parametrize("settings", [{"seed": 1.5}, {"seed": -1}, {"rank": 0, "world_size": True}])
+def test_what_is_no_whole_number_is_refused(root, settings):
+    with pytest.raises(ConfigError, match=r"(seed|world_size) is .*, expected a whole number of at least"):
+        stream(root, **settings)

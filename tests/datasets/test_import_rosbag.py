@@ -136,7 +136,7 @@ def test_rows_take_the_nearest_scan(tmp_path):
 
 def test_sequences_are_cut_by_length_and_by_pauses(tmp_path):
     path = record(tmp_path / "bag", "ros2", seconds=20.0, pause=(6.05, 9.95, "scan"), goals=())
-    manifest = import_rosbag(path, tmp_path / "d", length=20)
+    manifest = import_rosbag(path, tmp_path / "d", length=np.int64(20))
     c = rows_of(tmp_path / "d")
     assert verify(tmp_path / "d").ok
     _, sizes = np.unique(c["sequence"], return_counts=True)
@@ -246,7 +246,7 @@ def second_goal(bag):
             "come every 0.1 s, expected at least every 0.05 s; give a larger dt",
         ),
         (lambda b: None, {"dt": -1.0}, ConfigError, "expected positive numbers"),
-        (lambda b: None, {"length": 1}, ConfigError, "length is 1; expected 2 to"),
+        (lambda b: None, {"length": 1}, ConfigError, "length is 1, expected a whole number from 2 to"),
         (lambda b: None, {"mount": (1.0,)}, ConfigError, "mount has 1 numbers"),
     ],
 )

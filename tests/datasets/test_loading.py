@@ -1,5 +1,6 @@
 """make_loader yields what a plain DataLoader yields."""
 
+import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader
@@ -52,6 +53,23 @@ def test_shuffling_is_seeded_and_new_each_epoch(root):
     assert sum(len(b["mask"]) for b in make_loader(dataset, 4, drop_last=True)) == len(dataset) // 4 * 4
 
 
-def test_batch_size_is_checked(root):
-    with pytest.raises(ConfigError, match="batch_size is 0"):
-        make_loader(SequenceDataset(root, None), 0)
+@pytest.mark.parametrize("kind", [np.int64, np.uint8, np.array, torch.tensor])
+def test_whole_numbers_of_any_kind(root, kind):
+    dataset = SequenceDataset(root, None, window=8)
+    plain, other = make_loader(dataset, 2, seed=4), make_loader(dataset, kind(2), seed=kind(4), num_workers=kind(0))
+    for batch, same in zip(plain, other, strict=True):
+        assert torch.equal(batch["robot_state"], same["robot_state"])
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"batch_size": 0}, "batch_size is 0, expected a whole number of at least 1"),
+        ({"seed": 2.0}, "seed is 2.0, expected a whole number from 0"),
+        ({"seed": torch.tensor([1, 2])}, "seed is tensor"),
+        ({"num_workers": -1}, "num_workers is -1, expected a whole number of at least 0"),
+    ],
+)
+def test_numbers_are_checked(root, settings, words):
+    with pytest.raises(ConfigError, match=words):
+        make_loader(SequenceDataset(root, None), **{"batch_size": 2, **settings})

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from navrep_data.datasets import SequenceDataset, import_npz
@@ -381,6 +382,7 @@ def test_nothing_is_written_in_place_or_over_something(few, tmp_path):
         ({"outcomes": ["none"]}, "Unknown outcome 'none'"),
         ({"min_steps": 5, "max_steps": 4}, "bounds of steps are 5 and 4"),
         ({"min_humans": -1}, "bounds of humans are -1"),
+        ({"max_steps": 2.5}, "bounds of steps are 0 and 2.5; expected whole numbers"),
         ({"min_steps": 10_000}, r"Nothing is left: none of the \d+ episodes of .* fits \(.*goal \d"),
     ],
 )
@@ -574,3 +576,11 @@ def test_descriptions(few, tmp_path):
     found = edits.describe(filter(few, tmp_path / "out", outcomes=["goal"]), tmp_path / "out")
     assert set(found["episodes"]) == {Event.GOAL.label}
     assert sum(found["splits"].values()) == found["sequences"]
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.array, torch.tensor])
+def test_bounds_and_seeds_are_whole_numbers_of_any_kind(few, tmp_path, kind):
+    plain, other = filter(few, tmp_path / "a", min_steps=2), filter(few, tmp_path / "b", min_steps=kind(2))
+    assert other.shards == plain.shards
+    pictures = sample(few, tmp_path / "c", n=1, seed=3), sample(few, tmp_path / "d", n=1, seed=kind(3))
+    assert pictures[0][0].name == pictures[1][0].name

@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 from navrep_data.errors import MissingExtraError
 from navrep_data.registration import ENVIRONMENTS
@@ -13,6 +14,8 @@ from navrep_data.sim.maps import map_names
 PHYSICS = ("consistent", "original")
 NUMBERED = ["navrep-test", "navrep-val"]
 """Environments whose episodes are numpy seeds from a list."""
+KINDS = [np.int64, np.uint8, np.array, torch.tensor]
+"""What whole numbers come as, besides Python's own."""
 try:
     HAS_MAPS = bool(map_names())
 except MissingExtraError:

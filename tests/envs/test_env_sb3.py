@@ -5,7 +5,7 @@ import contextlib
 import gymnasium
 import numpy as np
 import pytest
-from env_cases import CASES, make, same
+from env_cases import CASES, KINDS, make, same
 
 from navrep_data import envs
 from navrep_data.envs import make_sb3_vec
@@ -161,3 +161,24 @@ def test_wrong_requests_say_so_in_one_line():
 def test_names_are_accepted_however_they_are_spelt():
     for name in ("navrep-test", "NavRepTest-v0", "navrep_data:NavRepTest-v0", "navreptest", "NavRepTest"):
         assert envs.NavRepEnv(name).config.env == "navrep-test"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_whole_numbers_of_any_kind(kind):
+    plain, other = make_sb3_vec("empty", 2, seed=2), make_sb3_vec("empty", kind(2), seed=kind(2))
+    assert same(plain.reset()["robot_state"], other.reset()["robot_state"])
+    plain.seed(255)
+    other.seed(kind(255))  # 256 is more than a byte holds
+    assert same(plain.reset()["robot_state"], other.reset()["robot_state"])
+    wanted = plain.env_method("state", indices=1)[0].robot
+    for indices in (kind(1), [kind(1)], np.array([1]), -1):
+        assert same(other.env_method("state", indices=indices)[0].robot, wanted)
+
+
+def test_what_is_no_seed_and_no_world_is_refused():
+    with pytest.raises(ConfigError, match=r"seed is 2\.5, expected a whole number from 0"):
+        make_sb3_vec("empty", 2, seed=2.5)
+    worlds = make_sb3_vec("empty", 2)
+    for indices in (1.5, [0, 1.5], 2, [-3]):
+        with pytest.raises(ConfigError, match=r"indices is .*, expected a whole number from -2 to 1"):
+            worlds.get_attr("config", indices)

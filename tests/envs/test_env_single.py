@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
-from env_cases import CASES, HAS_MAPS, NUMBERED, PHYSICS, STREAMED, make, same
+from env_cases import CASES, HAS_MAPS, KINDS, NUMBERED, PHYSICS, STREAMED, make, same
 from gymnasium.utils.env_checker import check_env
 from recorded import reference
 
@@ -256,3 +256,16 @@ def test_several_robots_have_an_axis():
     _, reward, _, _, info = env.step(env.action_space.sample())
     assert info["rewards"].shape == (10,)
     assert reward == pytest.approx(info["rewards"].mean())
+
+
+@pytest.mark.parametrize("env", ["empty", "navrep-test"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_seeds_are_whole_numbers_of_any_kind(env, kind):
+    plain, other = NavRepEnv(env), NavRepEnv(env)
+    assert same(plain.reset(seed=5)[0]["robot_state"], other.reset(seed=kind(5))[0]["robot_state"])
+
+
+@pytest.mark.parametrize("seed", [2.5, True, -1, [1], np.array([1, 2]), 2**63])
+def test_what_is_no_seed_is_refused(seed):
+    with pytest.raises(ConfigError, match=r"seed is .*, expected a whole number from 0"):
+        NavRepEnv("empty").reset(seed=seed)

@@ -3,7 +3,8 @@
 import gymnasium
 import numpy as np
 import pytest
-from env_cases import CASES, is_numbered, labelled, make, make_vec, param, same
+import torch
+from env_cases import CASES, KINDS, is_numbered, labelled, make, make_vec, param, same
 from gymnasium.vector import AutoresetMode
 
 from navrep_data.envs import NavRepEnv, NavRepVectorEnv, goal_policy
@@ -222,10 +223,36 @@ def test_wrong_calls_say_so_in_one_line():
         env.reset(options={"reset_mask": np.zeros(2, bool)})
     with pytest.raises(ConfigError, match="render_mode is 'human', expected one of: rgb_array"):
         NavRepVectorEnv(2, "navrep-test", render_mode="human")
-    with pytest.raises(ConfigError, match="n_worlds is 0"):
+    with pytest.raises(ConfigError, match="num_envs is 0"):
         NavRepVectorEnv(0)
     with pytest.raises(ConfigError, match=r"autoreset_mode is 'NextSteps', expected one of: .*mean 'NextStep'"):
         NavRepVectorEnv(1, autoreset_mode="NextSteps")
     with pytest.raises(ConfigError, match="max_episode_steps is 0, expected a whole number of at least 1"):
         NavRepVectorEnv(1, max_episode_steps=0)
     assert "navrep-test" in str(env) or "num_envs=2" in str(env)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_whole_numbers_of_any_kind(kind):
+    plain, other = NavRepVectorEnv(2, "empty"), NavRepVectorEnv(kind(2), "empty")
+    for expected, seeds in ((3, kind(3)), (3, [kind(3), kind(4)]), (3, np.array([3, 4])), ([None, 4], [None, kind(4)])):
+        a, b = plain.reset(seed=expected)[0], other.reset(seed=seeds)[0]
+        assert same(a["scan"], b["scan"])
+        assert same(a["robot_state"], b["robot_state"])
+    assert same(other.state(kind(1)).robot, plain.state(-1).robot)
+    assert same(other.frame(kind(1), 64), plain.frame(-1, 64))
+
+
+@pytest.mark.parametrize("seed", [2.5, True, -1, [0, -1], [None, 1.0], torch.tensor(1.0), np.array([0.5, 1.0])])
+def test_what_is_no_seed_is_refused(seed):
+    with pytest.raises(ConfigError, match=r"seed is .*, expected (a|one) whole number"):
+        NavRepVectorEnv(2, "empty").reset(seed=seed)
+
+
+@pytest.mark.parametrize("world", [2, -3, 1.0, True])
+def test_what_is_no_world_is_refused(world):
+    env = NavRepVectorEnv(2, "empty")
+    env.reset(seed=1)
+    for ask in (env.state, env.frame):
+        with pytest.raises(ConfigError, match=r"world is .*, expected a whole number from -2 to 1"):
+            ask(world)

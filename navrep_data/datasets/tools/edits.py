@@ -19,7 +19,7 @@ from navrep_data.datasets.tools._pieces import (
     check_sources,
     write_dataset,
 )
-from navrep_data.errors import ConfigError, did_you_mean
+from navrep_data.errors import ConfigError, did_you_mean, whole_number
 from navrep_data.io import new_folder, sha256_bytes
 from navrep_data.schema import EVENT_NAMES, Event
 from navrep_data.shards import SPLITS, DatasetFolder, Manifest
@@ -256,9 +256,12 @@ _UNBOUNDED = 1 << 31
 def _bounds(name: str, low: int | None, high: int | None) -> tuple[int, int] | None:
     if low is None and high is None:
         return None
-    first, last = 0 if low is None else low, _UNBOUNDED if high is None else high
-    if not 0 <= first <= last:
-        raise ConfigError(f"The bounds of {name} are {first} and {last}; expected 0 <= least <= most.")
+    given = 0 if low is None else low, _UNBOUNDED if high is None else high
+    first, last = map(whole_number, given)
+    if first is None or last is None or not 0 <= first <= last:
+        raise ConfigError(
+            f"The bounds of {name} are {given[0]} and {given[1]}; expected whole numbers, 0 <= least <= most."
+        )
     return first, last
 
 

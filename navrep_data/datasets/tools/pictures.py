@@ -9,7 +9,7 @@ import numpy as np
 
 from navrep_data.datasets._hub_pictures import read_episode, still
 from navrep_data.datasets.tools._pieces import Progress
-from navrep_data.errors import ConfigError
+from navrep_data.errors import ConfigError, check_whole
 from navrep_data.io import atomic_write_bytes, new_folder
 from navrep_data.shards import DatasetFolder
 
@@ -64,7 +64,9 @@ def sample(
         if not len(chosen):
             raise ConfigError(f"Nothing is left: {root} has no sequence" + (f" in split {split}." if split else "."))
         ends = np.cumsum(e.length[chosen])
-        drawn = np.random.default_rng(seed).choice(ends[-1], size=min(n, int(ends[-1])), replace=False)
+        drawn = np.random.default_rng(check_whole("seed", seed, 0)).choice(
+            ends[-1], size=min(n, int(ends[-1])), replace=False
+        )
         names = []
         with new_folder(out, what="sample", apart_from=[root]) as part:
             for done, at in enumerate(np.sort(drawn).tolist(), 1):
