@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Generator, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -216,7 +216,7 @@ def _play(
     total: int,
     path: Path,
     batch: int | None,
-    play: Callable[[Job], Iterator[list[Episode]]],
+    play: Callable[[Job], Generator[list[Episode]]],
     progress: Progress | None,
 ) -> bool:
     """Play what is missing, saving as episodes finish; returns whether anything was."""
@@ -226,14 +226,15 @@ def _play(
     job = Job(suite.name, physics, spec, tuple(todo), spec.inference == "as_released" and spec.kind in NETWORKS, batch)
     done, saved = total - len(todo), time.monotonic()
     try:
-        for finished in play(job):
-            results.add(finished)
-            done += len(finished)
-            if progress is not None:
-                progress(spec.name, done, total)
-            if finished and time.monotonic() - saved > SAVE_SECONDS:
-                results.save(path)
-                saved = time.monotonic()
+        with closing(play(job)) as played:
+            for finished in played:
+                results.add(finished)
+                done += len(finished)
+                if progress is not None:
+                    progress(spec.name, done, total)
+                if finished and time.monotonic() - saved > SAVE_SECONDS:
+                    results.save(path)
+                    saved = time.monotonic()
     finally:
         results.save(path)
     return True

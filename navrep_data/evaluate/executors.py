@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
 from typing import Any
@@ -56,13 +56,14 @@ class Job:
         return units(list(self.episodes), self.grouped)
 
 
-def _start(job: Job, suite: Suite, take: Any, count: int) -> Iterator[list[Episode]]:
-    pilot = job.pilot.make(suite.first_seed)
-    worlds = suite.make(suite.config(job.physics), n_worlds(pilot, job.batch, count))
-    return play(suite, worlds, pilot, take)
+def _start(job: Job, suite: Suite, take: Any, count: int) -> Generator[list[Episode]]:
+    with job.pilot.in_its_way():
+        pilot = job.pilot.make(suite.first_seed)
+        worlds = suite.make(suite.config(job.physics), n_worlds(pilot, job.batch, count))
+        yield from play(suite, worlds, pilot, take)
 
 
-def run(job: Job, workers: int) -> Iterator[list[Episode]]:
+def run(job: Job, workers: int) -> Generator[list[Episode]]:
     """Play a job and yield episodes as they end, in any order; empty lists while waiting.
 
     Parameters
@@ -78,6 +79,10 @@ def run(job: Job, workers: int) -> Iterator[list[Episode]]:
         If a worker process ended without a word.
     NavrepDataError
         What went wrong in a worker.
+
+    Notes
+    -----
+    Close it (``contextlib.closing``) where it may not be read to its end: then workers end, and torch is set as before.
     """
     todo = job.units()
     workers = min(workers, len(todo))
@@ -119,7 +124,7 @@ def _work(job: Job, share: int, taken: Any, results: Any) -> None:
         results.put(("bug", traceback.format_exc()))
 
 
-def _run_pool(job: Job, workers: int, n_units: int) -> Iterator[list[Episode]]:
+def _run_pool(job: Job, workers: int, n_units: int) -> Generator[list[Episode]]:
     context = get_context("spawn")
     taken, results = context.Value("q", 0), context.Queue()
     share = -(-len(job.episodes) // workers)
@@ -160,7 +165,7 @@ def _check_alive(pool: list[Any]) -> None:
             )
 
 
-def run_on_ray(job: Job, cluster: RayCluster[tuple[int, ...], list[Episode]]) -> Iterator[list[Episode]]:
+def run_on_ray(job: Job, cluster: RayCluster[tuple[int, ...], list[Episode]]) -> Generator[list[Episode]]:
     """Play a job on a cluster and yield episodes as tasks end, in any order; empty lists while waiting.
 
     Parameters

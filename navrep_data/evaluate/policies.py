@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -66,17 +67,28 @@ class PilotSpec:
     files: dict[str, str] = field(default_factory=dict)
     function: Callable[[Any, Any], Any] | None = None
 
+    @contextlib.contextmanager
+    def in_its_way(self) -> Iterator[None]:
+        """Set torch as networks are played: numbers must not depend on how many cores there are.
+
+        Worker processes are the parallelism. What torch was set to is put back at the end of the ``with``.
+        """
+        if self.kind not in NETWORKS:
+            yield
+            return
+        from navrep_data.models.checkpoint import one_thread
+
+        with one_thread():
+            yield
+
     def make(self, first_seed: int) -> Pilot:
         """Return the pilot itself; loads weights."""
         if self.kind == "baseline":
             return BASELINES[self.name]()
         if self.kind == "function":
             return FunctionPilot(self.name, self.function or load_callable(self.name, BASELINES))
-        import torch
-
         from navrep_data.zoo import load
 
-        torch.set_num_threads(1)  # so that numbers do not depend on the number of cores; workers are the parallelism
         if self.kind == "object":
             return ZooPilot(self.function or load_callable(self.name, BASELINES), first_seed, self.scaling)
         place, source = (Path(str(self.source)), None) if self.kind == "folder" else (self.name, self.source)

@@ -217,6 +217,17 @@ def building() -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch compute on one thread for a while: sums do not depend on the number of cores then."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 @building()
 def load(path: Path | str) -> nn.Module:
     """Read a network written by :func:`save`, in eval mode, on the CPU.

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from navrep_data.errors import ConfigError
+from navrep_data.models.checkpoint import building
 from navrep_data.models.vae import VAE, as_images
 
 _CHUNK = 256
@@ -48,6 +49,7 @@ def weight_levels() -> int:
     return _WEIGHT_LEVELS if _is_exact(_WEIGHT_LEVELS) else _NARROW_WEIGHT_LEVELS
 
 
+@building()
 def _is_exact(weight_levels: int) -> bool:
     """Tell whether the largest possible sums come out right; both kinds of layer, since they take different paths."""
     right = True
@@ -116,6 +118,7 @@ class QuantizedEncoder(nn.Module):
         If this torch or processor cannot multiply in 8 bits.
     """
 
+    @building()
     def __init__(self, vae: VAE, calibration: Tensor) -> None:
         super().__init__()
         if not can_quantize():

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from navrep_data.envs.sb3 import WorldBatch
+from navrep_data.models.checkpoint import one_thread
 from navrep_data.models.controllers import N_ACTIONS
 from navrep_data.schema import Event
 from navrep_data.sim import SimConfig, Simulator, velocity_commands
@@ -222,13 +223,8 @@ class WorldGroups(WorldBatch):
         """Do something with every group and its worlds' slice, side by side; each on one thread of torch's."""
         if len(self.groups) == 1:
             return [work(self.groups[0], self._slices[0])]
-        threads = torch.get_num_threads()
-        # of all threads: matrix products have one number for the whole process
-        torch.set_num_threads(1)
-        try:
+        with one_thread():  # of all threads: matrix products have one number for the whole process
             return list(self._pool.map(work, self.groups, self._slices))
-        finally:
-            torch.set_num_threads(threads)
 
     def reset(self) -> F32:
         """Start an episode in every world."""

@@ -6,7 +6,9 @@ import torch
 
 from navrep_data import zoo
 from navrep_data.datasets import SequenceDataset, make_loader
-from navrep_data.models import Controller, ControllerConfig
+from navrep_data.evaluate import benchmark
+from navrep_data.models import VAE, Controller, ControllerConfig, QuantizedEncoder, VAEConfig
+from navrep_data.models.quantized import can_quantize, weight_levels
 from navrep_data.testing import tiny_dataset
 from navrep_data.zoo.policy import Policy
 from navrep_data.zoo.sb3 import to_sb3
@@ -72,7 +74,8 @@ def test_datasets_are_the_same_whatever_torchs_defaults_are(tmp_path, other_sett
 @pytest.mark.slow
 def test_nothing_is_drawn_from_global_generators(tmp_path):
     tiny_dataset(tmp_path / "tiny")
-    controller = Controller(ControllerConfig(69))
+    controller, vae = Controller(ControllerConfig(69)), VAE(VAEConfig("rings"))
+    weight_levels.cache_clear()  # it tries the processor's instructions at the first call only
     torch.manual_seed(11)
     np.random.seed(11)  # noqa: NPY002  the generator that everybody shares
     state, numpy_state = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002
@@ -80,6 +83,8 @@ def test_nothing_is_drawn_from_global_generators(tmp_path):
         drive(name)
     drive(NAMES[0], inference="as_released")
     to_sb3(Policy(controller, "z", "rings", zoo.load(NAMES[0]).vae), device="cpu")
+    if can_quantize():
+        QuantizedEncoder(vae, torch.zeros(2, 64, 64))
     dataset = SequenceDataset(tmp_path / "tiny", lidar="1d", window=8)
     dataset[0]
     next(iter(make_loader(dataset, batch_size=2, shuffle=True, seed=3)))
@@ -87,3 +92,33 @@ def test_nothing_is_drawn_from_global_generators(tmp_path):
     after = np.random.get_state()  # noqa: NPY002
     assert (after[1] == numpy_state[1]).all()
     assert after[2:] == numpy_state[2:]
+
+
+@pytest.fixture
+def three_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_a_benchmark_plays_on_one_thread_and_puts_the_number_back(tmp_path, three_threads):
+    seen = []
+    benchmark(
+        ["e2e_1d.v1"], episodes=1, out=tmp_path, figures=False,
+        progress=lambda name, *_: seen.append((name, torch.get_num_threads())),
+    )  # fmt: skip
+    assert ("e2e_1d.v1", 1) in seen
+    assert ("goal", 3) in seen
+    assert torch.get_num_threads() == 3
+
+
+def test_a_benchmark_that_is_interrupted_puts_the_number_back(tmp_path, three_threads):
+    def interrupt(name, *_):
+        if name != "goal":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        benchmark(["e2e_1d.v1"], episodes=1, out=tmp_path, figures=False, progress=interrupt)
+    assert torch.get_num_threads() == 3, "while the traceback still holds the run's frames"
+    del caught
