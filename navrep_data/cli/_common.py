@@ -12,9 +12,6 @@ import typer
 
 from navrep_data.errors import FileAccessError
 
-INTERRUPTED = 130
-INTERRUPTED_LINE = "Interrupted. What was finished is intact; run the same command again to go on."
-
 
 def say(text: str) -> None:
     """Print a line for people to stdout."""

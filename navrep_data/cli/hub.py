@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import threading
@@ -11,7 +10,8 @@ from typing import Annotated
 
 import typer
 
-from navrep_data.cli._common import INTERRUPTED, INTERRUPTED_LINE, print_json, say, show_progress
+from navrep_data.cli._common import print_json, say, show_progress
+from navrep_data.cli.entry import stop
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Repo = Annotated[str, typer.Argument(metavar="USER/NAME", help="Repository on the Hugging Face Hub.")]
@@ -33,22 +33,16 @@ def _licence(given: str | None, known: str | None) -> str | None:
 
 
 def _prepare() -> None:
-    """Leave it to our errors to tell what went wrong, in one line, and let Ctrl-C end it at once."""
+    """Leave it to our errors to tell what went wrong, in one line, and let Ctrl-C end it at once.
+
+    huggingface_hub would wait for its threads, minutes where a server stalls. At any moment what lies on the disk and
+    on the Hub is whole: files appear by renaming, a push is one commit.
+    """
     from huggingface_hub.utils import logging
 
     logging.set_verbosity_error()  # type: ignore[no-untyped-call]
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, _stop)
-
-
-def _stop(*_: object) -> None:
-    """End the process: huggingface_hub would wait for its threads, minutes where a server stalls.
-
-    At any moment what lies on the disk and on the Hub is whole: files appear by renaming, a push is one commit.
-    """
-    sys.stderr.write(f"{INTERRUPTED_LINE}\n")
-    sys.stderr.flush()
-    os._exit(INTERRUPTED)
+        signal.signal(signal.SIGINT, stop)
 
 
 def push_command(

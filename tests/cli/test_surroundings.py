@@ -5,6 +5,8 @@ import os
 import signal
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 import typer
@@ -261,3 +263,36 @@ def test_processes_start_deaf_to_ctrl_c_and_none_is_lost(heard):
     with pytest.raises(KeyboardInterrupt):
         meanwhile()
     assert seen == ["blocked"]
+
+
+STARTS = {
+    "python -m": "import runpy; runpy.run_module('navrep_data', run_name='__main__')",
+    "script": "import importlib.metadata as m; m.EntryPoint('', SCRIPT, '').load()()",
+}
+
+
+@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("at", ["navrep_data.cli.main", "typer", "navrep_data.cli.info", "run"])
+def test_ctrl_c_while_modules_are_imported_is_one_line(start, at):
+    """The process sends itself the signal when it comes to import a module, or to the first line of main's run()."""
+    with open(Path(__file__).parents[2] / "pyproject.toml", "rb") as file:
+        script = tomllib.load(file)["project"]["scripts"]["navrep-data"]
+    program = f"""
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == {at!r}:
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+def trace(frame, *_):
+    if {at!r} == "run" == frame.f_code.co_name and frame.f_code.co_filename.endswith("main.py"):
+        signal.raise_signal(signal.SIGINT)
+sys.setprofile(trace)
+sys.argv = ["navrep-data", "info", "d"]
+SCRIPT = {script!r}
+{STARTS[start]}
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "Interrupted. What was finished is intact; run the same command again to go on.\n"
