@@ -65,6 +65,8 @@ def open_readers(
     ------
     CorruptDataError
         If it cannot be read; the message names the command that mends it, where one does.
+    FileAccessError
+        If the operating system refuses a file.
     """
     with explained(path):
         if path.is_dir():
@@ -89,6 +91,8 @@ def _open_folder(path: Path, ros2: Any, stack: contextlib.ExitStack, note: Calla
         except Exception as error:  # a cut YAML, a file that is not there, damaged storage: nearly anything
             if not files:
                 raise
+            if not isinstance(error, FileNotFoundError):  # one that the bag names
+                raise_refusal(error, metadata)  # it will be read once more, for its hash
             reason = f"has a metadata.yaml that does not fit ({_said(error)})"
     packed = sorted(item.name for item in path.iterdir() if item.name.endswith((".db3.zstd", ".mcap.zstd")))
     if not files and packed:

@@ -20,7 +20,7 @@ from navrep_data.datasets._bag import NO_TOPIC, Bag
 from navrep_data.datasets._bag_scans import Adapters
 from navrep_data.datasets._bag_types import Reading, Topics, Tracks
 from navrep_data.datasets.npz import MAX_ROWS_PER_SHARD, MAX_SEQUENCES_PER_SHARD, align
-from navrep_data.errors import ConfigError, DatasetError, check_whole
+from navrep_data.errors import ConfigError, DatasetError, check_whole, one_line
 from navrep_data.io import new_folder, sha256_bytes, sha256_file
 from navrep_data.observations import scan_to_rings
 from navrep_data.observations.blind import declaration, runs_of
@@ -167,7 +167,11 @@ def import_rosbag(
     _check(paths, dt, range_max, mount, goal_radius)
     length = check_whole("length", length, 2, MAX_LENGTH)
     reading = Reading(mount, reach, invalid_is_free, assume_same_frame)
-    say = _print if note is None else note
+    tell = _print if note is None else note
+
+    def say(line: str) -> None:
+        tell(one_line(line))  # names and errors of other libraries are quoted
+
     recordings = []
     for path in paths:
         with Bag(path, scan_topic, odometry_topic, goal_topic, say) as bag:

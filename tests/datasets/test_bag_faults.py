@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 import re
 import shutil
 import sqlite3
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from navrep_data.datasets import import_rosbag
 from navrep_data.doctor import check_dataset
-from navrep_data.errors import ConfigError, CorruptDataError, DatasetError
+from navrep_data.errors import LONGEST_MESSAGE, ConfigError, CorruptDataError, DatasetError, FileAccessError
 from navrep_data.shards import DatasetFolder
 
 pytest.importorskip("rosbags")
@@ -280,6 +283,34 @@ def test_folders_without_metadata(tmp_path, kind):
         manifest, said = read(path, tmp_path / "d")
         assert manifest.shards[0].sequence_hashes == expected
         assert [line for line in said if "directly" in line and "ros2 bag reindex" in line]
+
+
+@pytest.mark.parametrize("code", [errno.EACCES, errno.EIO])
+def test_metadata_that_cannot_be_read_is_refused_at_once(tmp_path, monkeypatch, code):
+    """It says nothing about what is in it, and the import would end at its hash."""
+    path = record(tmp_path / "bag", "ros2", seconds=2.0)
+    read_text = Path.read_text
+
+    def refuse(self, *arguments, **named):
+        if self.name == "metadata.yaml":
+            raise OSError(code, os.strerror(code), str(self))
+        return read_text(self, *arguments, **named)
+
+    monkeypatch.setattr(Path, "read_text", refuse)
+    said = []
+    with pytest.raises(FileAccessError, match=rf"refuses .*metadata\.yaml: {os.strerror(code)}\. Expected|The disk"):
+        import_rosbag(path, tmp_path / "d", note=said.append)
+    assert said == []
+
+
+def test_notes_are_one_line_of_bounded_length(tmp_path):
+    path = record(tmp_path / "bag", "ros2", seconds=2.0)
+    (path / "metadata.yaml").write_text('a: "\x1b[31m' + 5000 * "x" + "\nb: [")
+    said = read(path, tmp_path / "d")[1]
+    (line,) = [line for line in said if "does not fit" in line]
+    assert line.isprintable()
+    assert len(line) <= LONGEST_MESSAGE
+    assert "ros2 bag reindex" in line
 
 
 def test_split_recordings_without_metadata(tmp_path):
