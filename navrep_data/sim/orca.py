@@ -154,12 +154,18 @@ def _matrix(name: str, value: ArrayLike, n: int | None) -> NDArray[np.float64]:
             f"{name} has shape {array.shape}; expected ({'N' if n is None else n}, 2). Pass rows of x, y."
         )
     _check_finite(name, array)
-    if array.size and np.abs(array).max() > MAX_COORDINATE:
-        raise ConfigError(
-            f"{name} holds {np.abs(array).max():g}; expected coordinates within {MAX_COORDINATE:.0f} m of 0, where "
-            "float32 keeps their millimetres. Subtract a common offset."
-        )
+    check_near_zero(name, array)
     return np.ascontiguousarray(array)
+
+
+def check_near_zero(name: str, coordinates: NDArray[np.float64]) -> None:
+    """Raise ConfigError unless finite coordinates [m] are so near 0 that ORCA can reckon with them."""
+    largest = np.abs(coordinates).max(initial=0.0)
+    if largest > MAX_COORDINATE:
+        raise ConfigError(
+            f"{name} holds {largest:g}; expected coordinates within {MAX_COORDINATE:.0f} m of 0, where float32 keeps "
+            "their millimetres. Subtract a common offset."
+        )
 
 
 def _column(name: str, value: ArrayLike, n: int) -> NDArray[np.float64]:

@@ -21,6 +21,7 @@ from navrep_data.sim._orca import make_orca_work
 from navrep_data.sim.config import SimConfig, kernel_flags, kernel_params, orca_params
 from navrep_data.sim.lidar import ray_directions
 from navrep_data.sim.map_worlds import MapWorlds
+from navrep_data.sim.orca import check_near_zero
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -63,6 +64,8 @@ def check_place(simulator: Simulator, world: int, where: F64) -> None:
             "scenarios, such as map."
         )
     for name, (x, y) in (("start", where[:2]), ("goal", where[3:])):
+        if simulator.maps is None:  # maps lie within these bounds
+            check_near_zero(f"The {name}", np.array([x, y]))
         gap = float(simulator.clearance([[x, y]], world)[0])
         if not gap >= radius - _TOUCHING:
             raise ConfigError(

@@ -90,6 +90,12 @@ def test_planners_follow_a_new_goal_on_maps(env):
         ("empty", {"start": "here"}, r"start is here, expected finite x, y \[m\], or with a heading \[rad\]"),
         ("empty", {"goal": (1.0, np.nan)}, r"goal is \(1.0, nan\), expected finite x, y \[m\]"),
         ("empty", {"goal": (1.0, 2.0, 3.0)}, "goal is .*expected finite"),
+        (
+            "empty",
+            {"start": (456000.0, 5428000.0, 0.0), "goal": (456005.0, 5428000.0)},
+            r"The start holds 5.428e\+06; expected coordinates within 16384 m of 0, .*Subtract a common offset",
+        ),
+        ("cadrl", {"goal": (0.0, -16385.0)}, "The goal holds 16385; expected coordinates within 16384 m of 0"),
         ("empty", {"gaol": (1.0, 2.0)}, "Unknown reset option 'gaol', expected one of: episode, goal"),
     ],
 )
