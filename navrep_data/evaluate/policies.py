@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shlex
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,8 +17,8 @@ from navrep_data.io import sha256_file
 from navrep_data.schema import INFERENCE, RANGES, SCALING
 from navrep_data.sim.driving import knows_robots
 from navrep_data.zoo.fetching import HUB_SCHEME
-from navrep_data.zoo.folders import is_path, place_of, policy_files
-from navrep_data.zoo.names import here_hint
+from navrep_data.zoo.folders import place_of, policy_files
+from navrep_data.zoo.names import here_hint, is_path
 
 BASELINES: dict[str, type[Pilot]] = {pilot.name: pilot for pilot in (GoalPilot, RandomPilot, OrcaPilot, DwaPilot)}
 """Policies without weights, by name."""
@@ -206,7 +204,6 @@ def _from_folder(name: str, how: dict[str, str]) -> PilotSpec:
     folder = place.resolve()
     if not name.startswith(HUB_SCHEME):
         name = os.path.normpath(name)
-    _refuse_sb3(folder)
     if how["ranges"] == "as_released":
         raise _not_released(name)
     loaded = load(folder)  # told before the first episode is played
@@ -217,25 +214,6 @@ def _from_folder(name: str, how: dict[str, str]) -> PilotSpec:
         )
     files = {part: sha256_file(path) for part, path in policy_files(folder).items()}
     return PilotSpec(name, "scan", name, "folder", str(folder), files=files).fed(**how)
-
-
-def _refuse_sb3(path: Path) -> None:
-    """Say what to write for a stable-baselines3 file: it holds pickled objects, which nothing here opens."""
-    try:
-        with zipfile.ZipFile(path) as found:
-            if "_stable_baselines3_version" not in found.namelist():
-                return
-    except (OSError, zipfile.BadZipFile):
-        return
-    code = (
-        f"from stable_baselines3 import PPO; model = PPO.load({str(path)!r}); act = lambda scan, robot_state: "
-        'model.predict({"scan": scan.clip(0, 25), "robot_state": robot_state}, deterministic=True)[0]'
-    )
-    raise PolicyError(
-        f"{path.name} is a file of stable-baselines3: it holds pickled objects, which run code when loaded, so "
-        f"navrep-data does not open it. If it is yours, write one line of Python and name that: echo "
-        f"{shlex.quote(code)} > sb3_policy.py && navrep-data benchmark sb3_policy:act"
-    )
 
 
 def _from_zoo(name: str, source: str | None, how: dict[str, str]) -> PilotSpec:

@@ -15,8 +15,8 @@ from navrep_data.evaluate.world_model import WorldModelError
 from navrep_data.evaluate.world_model_results import FOLDER
 from navrep_data.evaluate.world_model_results import load as load_world_model
 from navrep_data.zoo import measured, registry
-from navrep_data.zoo.folders import is_path, place_of
-from navrep_data.zoo.names import OWN
+from navrep_data.zoo.folders import place_of
+from navrep_data.zoo.names import OWN, is_path
 from navrep_data.zoo.registry import Record
 
 SOURCES = {

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data.errors import PolicyError, check_whole
+from navrep_data.sb3_file import refuse_sb3_file
 from navrep_data.sim import (
     SCRIPTED,
     CallableMapRollout,
@@ -68,6 +69,7 @@ def make_policy(policy: str | PolicyFunction, batch: int) -> PolicySpec:
         kind = policy if hasattr(policy, "__qualname__") else type(policy)
         return PolicySpec(f"{kind.__module__}:{kind.__qualname__}", batch, policy)
     if "/" in policy or policy.startswith("~"):
+        refuse_sb3_file(Path(policy).expanduser(), "navrep-data generate --policy")
         raise PolicyError(
             f"policy is {policy!r}, expected one of: {', '.join(SCRIPTED)}, or module:function. A network drives as "
             f"one: a file drive.py with the line `from navrep_data import zoo; policy = zoo.load({policy!r})` is named "

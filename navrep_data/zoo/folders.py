@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from navrep_data.errors import CheckpointError, ConfigError, ModelNotFoundError
 from navrep_data.io import atomic_write_json, read_json
+from navrep_data.sb3_file import refuse_sb3_file
 from navrep_data.schema import RobotContract, SensorContract
 from navrep_data.zoo.fetching import HUB_SCHEME
+from navrep_data.zoo.names import is_path
 
 if TYPE_CHECKING:
     from torch import nn
@@ -33,13 +35,6 @@ _CONTEXTS = ("oldest-32", "newest-32", "carried-state")
 _KINDS = {"vae": "vae", "memory": "memory", "controller": "controller", "e2e": "policy"}
 
 
-def is_path(name: str | os.PathLike[str]) -> bool:
-    """Return whether a model is named by its place: ``./folder``, ``hf://user/name``, ``FILE.safetensors``, a path."""
-    if not isinstance(name, str):
-        return True
-    return "/" in name or os.sep in name or name in (".", "..") or name.startswith("~") or name.endswith(".safetensors")
-
-
 def place_of(name: str | os.PathLike[str]) -> Path | None:
     """Return where on this machine the model lies that is named by its place; None for a name of the zoo.
 
@@ -53,6 +48,8 @@ def place_of(name: str | os.PathLike[str]) -> Path | None:
     ------
     HubError, OfflineError, DownloadError, CorruptDataError
         If a model on the Hub cannot be had.
+    PolicyError
+        If it is a file of stable-baselines3, which nothing here opens.
     """
     if not is_path(name):
         return None
@@ -60,7 +57,9 @@ def place_of(name: str | os.PathLike[str]) -> Path | None:
         from navrep_data.zoo.hub import fetch_model
 
         return fetch_model(name)
-    return Path(name).expanduser()
+    place = Path(name).expanduser()
+    refuse_sb3_file(place)
+    return place
 
 
 def save_policy(policy: Policy, folder: Path | str, metadata: Mapping[str, Any] | None = None) -> Path:

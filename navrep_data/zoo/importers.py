@@ -13,6 +13,7 @@ from torch import nn
 
 from navrep_data.errors import CheckpointError
 from navrep_data.models import checkpoint
+from navrep_data.sb3_file import refuse_sb3_file
 from navrep_data.zoo.importers_bounds import opened, zip_members
 from navrep_data.zoo.importers_sb2 import load_controller_zip
 from navrep_data.zoo.importers_tf import load_tf_json
@@ -38,8 +39,11 @@ def load_any(path: Path | str) -> nn.Module:
     ------
     CheckpointError
         If it is none of them, or broken.
+    PolicyError
+        If it is a file of stable-baselines3.
     """
     path = Path(path)
+    refuse_sb3_file(path)
     if path.is_dir() or path.suffix == ".safetensors":
         return checkpoint.load(path)
     with opened(path) as handle:

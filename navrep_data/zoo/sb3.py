@@ -16,7 +16,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
-from navrep_data.errors import ConfigError
+from navrep_data.errors import CheckpointError, ConfigError
 from navrep_data.models.checkpoint import building
 from navrep_data.models.config import EndToEndConfig
 from navrep_data.models.controllers import LEAST_STD, MOST_STD, ActorCritic, EndToEnd, limit_speed
@@ -273,6 +273,34 @@ def put_weights(target: ActorCriticPolicy, network: ActorCritic) -> None:
     target.log_std.copy_(network.logstd)
     if isinstance(target, BoundedPolicy):
         target.bound_width()
+
+
+def from_sb3(model: PPO, policy: Policy) -> Policy:
+    """Return a policy whose controller is what stable-baselines3 trained: the way back from :func:`to_sb3`.
+
+    Parameters
+    ----------
+    model : PPO
+        From ``load_sb3``, or its saved file as ``ControllerPPO.load(FILE)`` gives it.
+    policy : Policy
+        Loaded by the name that ``load_sb3`` was given. Its encoder and memory are kept, its controller is overwritten.
+
+    Raises
+    ------
+    CheckpointError
+        If the model's controller is another one than the policy's.
+    """
+    expected, seen = (policy.n_inputs,), model.observation_space.shape
+    if seen != expected:
+        raise CheckpointError(
+            f"The model takes observations {seen}, but the controller of {policy.name or 'this policy'} {expected}: "
+            "give the policy that load_sb3 was given."
+        )
+    take_weights(policy.network, model.policy)
+    if isinstance(policy.network, EndToEnd):
+        # its encoder is a frozen copy of weights that have changed
+        policy._encoder = policy._make_encoder("float32", False)
+    return policy
 
 
 def take_weights(network: ActorCritic, source: ActorCriticPolicy) -> None:
