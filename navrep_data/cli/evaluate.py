@@ -25,7 +25,9 @@ def world_model_command(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Write results to DIR/world-model, for reproduce.")
     ] = None,
-    figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Draw the errors.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option("--figure", metavar="FILE", help="Draw the errors: .png, .pdf or .svg.")
+    ] = None,
     device: Annotated[str, typer.Option("--device", help="cpu, cuda, ...")] = "cpu",
     threads: Annotated[int | None, typer.Option("--threads", help="Threads of torch.", show_default="torch's")] = None,
     source: Annotated[str | None, typer.Option("--from", metavar="DIR", help="Folder with the authors' files.")] = None,
@@ -38,12 +40,15 @@ def world_model_command(
     from navrep_data.cli.train import check_device, use_threads
     from navrep_data.evaluate import world_model as measure
     from navrep_data.evaluate import world_model_results as files
+    from navrep_data.evaluate.reproduce.formats import check_suffix
     from navrep_data.evaluate.sources import full_name, weights_of
     from navrep_data.shards import dataset_record
     from navrep_data.zoo.local import load_any_model
 
     if split not in ("train", "val", "test"):
         raise ConfigError(f"--split is {split!r}, expected train, val or test.")
+    if figure is not None:  # told before minutes of measuring
+        check_suffix(figure, False, "--figure")
     use_threads(threads)
     check_device(device)
     results = []

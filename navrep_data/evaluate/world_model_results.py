@@ -125,16 +125,17 @@ def _short(name: str) -> str:
 def figure(results: Sequence[WorldModelError], path: Path | str) -> None:
     """Draw the errors of the next step as bars and those of the dream as curves, lidar and goal apart.
 
-    A V alone, which predicts nothing, is left out.
+    A V alone, which predicts nothing, is left out. The file's suffix is its format: png, pdf or svg.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    from navrep_data.evaluate.reproduce.formats import check_suffix, write_picture
+
+    check_suffix(Path(path), False, "--figure")
     results = [r for r in results if r.scan_mse is not None]
     if not results:
         raise ConfigError("There is no world model to draw, expected one beside V: leave out --figure.")
     picture = Figure(figsize=(9.0, 6.0), dpi=120, layout="constrained")
-    canvas = FigureCanvasAgg(picture)
     axes = picture.subplots(2, 2)
     picture.suptitle(f"World-model error, {results[0].split} split", fontsize=11)
     units = {"rings": "MSE of rings", "1d": "MSE of ranges / 25 m"}
@@ -158,4 +159,4 @@ def figure(results: Sequence[WorldModelError], path: Path | str) -> None:
         curves.set_ylabel(label)
         curves.set_ylim(bottom=0)
         curves.legend(fontsize=7)
-    canvas.print_png(str(path))  # type: ignore[no-untyped-call]
+    write_picture(picture, Path(path))

@@ -97,6 +97,11 @@ def test_table_and_figure(dataset, tmp_path):
     assert "standing still" in lines[2]
     figure(results, tmp_path / "errors.png")
     assert (tmp_path / "errors.png").read_bytes().startswith(b"\x89PNG")
+    for name, start in (("errors.pdf", b"%PDF"), ("errors.svg", b"<?xml")):
+        figure(results, tmp_path / name)
+        assert (tmp_path / name).read_bytes().startswith(start)
+    with pytest.raises(ConfigError, match=r"--figure is .*errors.jpg, expected a name .* \.png, \.pdf, \.svg"):
+        figure(results, tmp_path / "errors.jpg")
 
 
 def test_of_v_alone_the_reconstruction_is_measured_over_the_same_rows(dataset, tmp_path):

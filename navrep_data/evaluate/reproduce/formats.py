@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from navrep_data.errors import ConfigError
 from navrep_data.evaluate.figures import save
@@ -21,8 +22,8 @@ _LATEX |= {c: f"\\{c}" for c in "&%$#_{}"}
 _UNSAFE = re.compile("[" + re.escape("".join(_LATEX)) + "]")
 
 
-def check_suffix(path: Path, is_table: bool) -> None:
-    """Refuse a file whose suffix names no format.
+def check_suffix(path: Path, is_table: bool, flag: str = "--out") -> None:
+    """Refuse a file whose suffix names no format; `flag` is what the file was given by.
 
     Raises
     ------
@@ -32,7 +33,7 @@ def check_suffix(path: Path, is_table: bool) -> None:
     known = TABLES if is_table else PICTURES
     if path.suffix.lower() not in known:
         what = "a table" if is_table else "a figure"
-        raise ConfigError(f"--out is {path}, expected a name for {what} that ends in {', '.join(known)}.")
+        raise ConfigError(f"{flag} is {path}, expected a name for {what} that ends in {', '.join(known)}.")
 
 
 def write(drawn: Drawn, path: Path) -> None:
@@ -41,19 +42,26 @@ def write(drawn: Drawn, path: Path) -> None:
     if drawn.text is not None:
         as_text: dict[str, Callable[[Drawn], str]] = {".md": lambda d: d.text or "", ".tex": latex, ".csv": numbers}
         atomic_write_bytes(path, as_text[suffix](drawn).encode())
-    elif suffix == ".png":
-        save(drawn.figure, path)
     else:
-        atomic_write_bytes(path, _vector(drawn, suffix[1:]))
+        write_picture(drawn.figure, path)
 
 
-def _vector(drawn: Drawn, kind: str) -> bytes:
+def write_picture(figure: Any, path: Path) -> None:
+    """Write a matplotlib figure, in the format of the suffix."""
+    suffix = path.suffix.lower()
+    if suffix == ".png":
+        save(figure, path)
+    else:
+        atomic_write_bytes(path, _vector(figure, suffix[1:]))
+
+
+def _vector(figure: Any, kind: str) -> bytes:
     import matplotlib
 
     # equal results give equal bytes: no date, and identifiers that are not random
     with matplotlib.rc_context({"svg.hashsalt": "navrep-data", "pdf.fonttype": 42}):
         buffer = io.BytesIO()
-        drawn.figure.savefig(buffer, format=kind, metadata={"Date": None} if kind == "svg" else {"CreationDate": None})
+        figure.savefig(buffer, format=kind, metadata={"Date": None} if kind == "svg" else {"CreationDate": None})
     return buffer.getvalue()
 
 
