@@ -115,7 +115,7 @@ USUAL = {
     "n_steps": "rollout", "num_steps": "rollout", "rollout_length": "rollout", "n_envs": "worlds",
     "num_envs": "worlds", "num_worlds": "worlds", "n_epochs": "epochs", "num_epochs": "epochs",
     "ent_coef": "entropy", "entropy_coef": "entropy", "vf_coef": "value_weight", "value_coef": "value_weight",
-    "discount": "gamma", "lam": "gae_lambda", "lambda": "gae_lambda", "clip_eps": "clip_range",
+    "discount": "gamma", "lam": "gae_lambda", "lambda": "gae_lambda", "gae": "gae_lambda", "clip_eps": "clip_range",
     "clip_param": "clip_range", "total_timesteps": "steps", "max_steps": "steps", "iterations": "steps",
     "grad_clip": "clip_norm", "gradient_clip": "clip_norm", "adam_eps": "epsilon", "eps": "epsilon",
     "wd": "weight_decay", "l2": "weight_decay", "beta": "kl_weight", "kl_coef": "kl_weight",
@@ -157,7 +157,8 @@ def hint(name: str, known: Iterable[str]) -> str:
     for candidate in (ours, _OTHERWISE.get(ours, "")):
         if candidate in names:
             return f" Did you mean {candidate!r}?"
-    return did_you_mean(name, names)
+    # a usual name is known to mean something that the stage lacks: what is spelt like it means something else
+    return did_you_mean(name, names) if ours == name else ""
 
 
 def parse(pairs: Iterable[str], known: Mapping[str, Any], stage: str) -> dict[str, Any]:

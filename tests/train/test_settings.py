@@ -53,9 +53,15 @@ def test_the_command_lists_and_ends(capsys):
     assert all(f"[{stage}]" in out for stage in STAGES)
 
 
+@pytest.mark.parametrize("name", ["beta", "latent_dim"])
+def test_a_usual_name_of_what_a_stage_lacks_is_not_taken_for_what_is_spelt_like_it(name):
+    assert hint(name, [n for n, (stages, _, _) in DESCRIPTIONS.items() if "controller" in stages]) == ""
+
+
 @pytest.mark.parametrize(
     ("stage", "name", "ours"),
     [
+        ("e2e", "gae", "gae_lambda"), ("v", "beta", "kl_weight"),
         ("controller", "learning_rate", "lr"), ("controller", "n_steps", "rollout"), ("e2e", "batch_size", "batch"),
         ("e2e", "n_envs", "worlds"), ("controller", "ent_coef", "entropy"), ("v", "learning_rate", "lr"),
         ("v", "latent_dim", "z_size"), ("v", "n_epochs", "steps"), ("joint", "hidden_size", "h_size"),
