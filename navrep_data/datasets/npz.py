@@ -376,8 +376,13 @@ def _plan(
         command=shlex.join(
             ["navrep-data", "import-npz", "DIR" if len(files) > 1 else files[0].name, "--out", "OUT", "--env", env]
         )
-        + f" --range-max {sensor.range_max:g}",
+        + f" --range-max {exact(sensor.range_max)}",
     )
+
+
+def exact(value: float) -> str:
+    """Return a number as a command line on a card says it: the shortest text that reads back as the same number."""
+    return repr(float(value)).removesuffix(".0")
 
 
 def _write(

@@ -19,7 +19,7 @@ from navrep_data._version import __version__
 from navrep_data.datasets._bag import NO_TOPIC, Bag
 from navrep_data.datasets._bag_scans import Adapters
 from navrep_data.datasets._bag_types import Reading, Topics, Tracks
-from navrep_data.datasets.npz import MAX_ROWS_PER_SHARD, MAX_SEQUENCES_PER_SHARD, align
+from navrep_data.datasets.npz import MAX_ROWS_PER_SHARD, MAX_SEQUENCES_PER_SHARD, align, exact
 from navrep_data.errors import ConfigError, DatasetError, check_whole, one_line
 from navrep_data.io import new_folder, sha256_bytes, sha256_file
 from navrep_data.observations import scan_to_rings
@@ -336,11 +336,11 @@ def _command(
 ) -> str:
     """Return the command line that makes the same dataset: for the card."""
     words = ["navrep-data", "import-rosbag", *["BAG"] * n, "--out", "OUT", "--env", env]
-    words += ["--dt", f"{sensor.dt:g}", "--length", str(length), "--range-max", f"{sensor.range_max:g}"]
+    words += ["--dt", exact(sensor.dt), "--length", str(length), "--range-max", exact(sensor.range_max)]
     words += [word for flag, topic in topics.items() if topic is not None for word in (flag, topic)]
     if any(reading.mount):
-        words += ["--mount", ",".join(f"{v:g}" for v in reading.mount)]
-    words += ["--goal-radius", f"{radius:g}"]
+        words += ["--mount", ",".join(map(exact, reading.mount))]
+    words += ["--goal-radius", exact(radius)]
     words += ["--assume-same-frame"] if reading.assume_same_frame else []
     words += ["--invalid-is-free"] if reading.invalid_is_free else []
     return shlex.join(words)

@@ -355,3 +355,8 @@ def test_the_card_gives_the_whole_command(tmp_path):
     manifest = import_npz(write(tmp_path / "in", sequence()), tmp_path / "d", env="my lab", range_max=30.0)
     assert manifest.command.endswith("--out OUT --env 'my lab' --range-max 30")
     assert manifest.command in (tmp_path / "d" / "README.md").read_text()
+
+
+def test_numbers_on_the_card_are_exact(tmp_path):
+    manifest = import_npz(write(tmp_path / "in", sequence()), tmp_path / "d", range_max=100 / 3)
+    assert float(manifest.command.split("--range-max ")[1]) == 100 / 3

@@ -63,6 +63,19 @@ def rows_of_import(tmp_path, name, **settings):
     return rows_of(tmp_path / name)
 
 
+def test_the_card_gives_numbers_exactly(tmp_path):
+    bag = record(tmp_path / "bag", KINDS[0], seconds=3.0, goals=())
+    given = {"--dt": 1 / 3, "--range-max": 25 + 1e-7, "--goal-radius": 2 / 3}
+    mount = (0.1, 1 / 3, -1e-7)
+    manifest = import_rosbag(
+        bag, tmp_path / "d", dt=given["--dt"], range_max=given["--range-max"], goal_radius=given["--goal-radius"],
+        mount=mount,
+    )  # fmt: skip
+    words = manifest.command.split()
+    assert {flag: float(words[words.index(flag) + 1]) for flag in given} == given
+    assert parse_mount(words[words.index("--mount") + 1]) == mount
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_bag(tmp_path, kind):
     """Goal at x = 2, known from 0.35 s, reached (nearer than 0.5 m) after x = 1.5 (3.0 s): in the row at 3.2 s."""

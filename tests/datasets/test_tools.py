@@ -286,6 +286,13 @@ def test_split_by_shares_keeps_what_came_from_one_sequence_together(few, many, t
     assert "drawn with seed 3" in Manifest.read(tmp_path / "a" / "val").split_rule
 
 
+def test_the_command_of_a_split_gives_its_shares_exactly(many, tmp_path):
+    shares = {"train": 1 / 3, "val": 1 / 3, "test": 1 - 2 / 3}
+    made = split(many, tmp_path / "s", shares=shares)
+    words = made["train"].command.split()
+    assert [float(v) for v in words[words.index("--shares") + 1].split(",")] == list(shares.values())
+
+
 @pytest.mark.parametrize(
     ("shares", "words"),
     [

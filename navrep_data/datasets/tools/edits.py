@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from navrep_data.datasets.npz import exact
 from navrep_data.datasets.tools._pieces import (
     Given,
     Piece,
@@ -124,7 +125,7 @@ def split(
     else:
         parts = ", ".join(f"{name} {shares.get(name, 0.0):g}" for name in SPLITS)
         chosen, rule = _draw(pieces, shares, seed), f"drawn with seed {seed} from whole source sequences: {parts}"
-    options = "" if shares is None else f" --shares {','.join(f'{shares.get(n, 0.0):g}' for n in SPLITS)} --seed {seed}"
+    options = "" if shares is None else f" --shares {','.join(exact(shares.get(n, 0.0)) for n in SPLITS)} --seed {seed}"
     groups = {name: [p for p, c in zip(pieces, chosen, strict=True) if c == name] for name in SPLITS}
     check_not_empty([p for group in groups.values() for p in group], f"no sequence of {root} is in a split.")
     total, done = sum(map(len, groups.values())), 0
