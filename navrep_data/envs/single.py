@@ -18,7 +18,7 @@ from navrep_data.envs.worlds import (
     action_space,
     make_env_config,
     observation_space,
-    with_length,
+    own_spec,
 )
 from navrep_data.sim import SimConfig
 from navrep_data.sim.raster import Camera, draw_frame
@@ -113,7 +113,7 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @spec.setter
     def spec(self, spec: Any) -> None:
-        self._spec = with_length(spec, self.config.max_steps)
+        self._spec = own_spec(spec, self.config, self.config.max_steps)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

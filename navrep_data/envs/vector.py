@@ -21,7 +21,7 @@ from navrep_data.envs.worlds import (
     action_space,
     make_env_config,
     observation_space,
-    with_length,
+    own_spec,
 )
 from navrep_data.errors import ConfigError, check_whole, did_you_mean, whole_number
 from navrep_data.schema import Event
@@ -131,7 +131,7 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
 
     @spec.setter
     def spec(self, spec: Any) -> None:
-        self._spec = with_length(spec, self._most_steps or self.config.max_steps)
+        self._spec = own_spec(spec, self.config, self._most_steps or self.config.max_steps)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None

@@ -70,15 +70,19 @@ def state_bounds(config: SimConfig) -> tuple[F32, F32]:
     return -high, high
 
 
-def with_length(spec: Any, most_steps: int | None) -> Any:
-    """Return a copy of an environment's spec that says how many steps an episode has at most.
+def own_spec(spec: Any, config: SimConfig, most_steps: int | None) -> Any:
+    """Return a copy of an environment's spec that makes it again anywhere, and says how many steps an episode has.
 
-    The registered spec does not, since settings change it; and gymnasium would cut episodes beside the simulator.
+    The registered spec does not say it, since settings change it; and gymnasium would cut episodes beside the
+    simulator. Maps are where they were found, whatever the working folder is later.
     """
-    if spec is None or spec.max_episode_steps is not None:
-        return spec
+    if spec is None:
+        return None
     spec = copy.deepcopy(spec)
-    spec.max_episode_steps = most_steps
+    if spec.max_episode_steps is None:
+        spec.max_episode_steps = most_steps
+    if spec.kwargs.get("maps"):
+        spec.kwargs["maps"] = config.map_files
     return spec
 
 

@@ -5,6 +5,7 @@ import sys
 
 import gymnasium
 import pytest
+from PIL import Image
 
 import navrep_data.envs  # registers
 from navrep_data.registration import ENVIRONMENTS, camel_case, register
@@ -67,3 +68,20 @@ def test_ids_work_in_any_order_of_imports_and_without_torch(code):
 
 def test_there_is_one_word_for_each_public_thing():
     assert all(hasattr(navrep_data.envs, name) for name in navrep_data.envs.__all__)
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, lambda spec, **kw: gymnasium.make_vec(spec, num_envs=2, **kw)])
+def test_a_spec_finds_its_maps_from_any_working_folder(make, tmp_path, monkeypatch):
+    folder = tmp_path / "mm"
+    folder.mkdir()
+    Image.new("L", (60, 60), 254).save(folder / "m.png")
+    (folder / "m.yaml").write_text(
+        "image: m.png\nresolution: 0.2\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    spec = make("Map-v0", maps=("./mm",), humans=2).spec
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    again = make(spec)
+    assert again.unwrapped.config.map_files == (str(folder),)
+    again.reset(seed=0)
