@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -41,27 +42,34 @@ class _VerbOrPattern(typer.core.TyperGroup):
 
 models_app = typer.Typer(
     cls=_VerbOrPattern,
-    help="List checkpoints, the released ones and our own ([PATTERN], --json), or show, fetch, verify, convert them.",
-    subcommand_metavar="[PATTERN] | VERB [ARGS]...",
+    help="List checkpoints, released ones and our own ([PATTERN]..., --json), or show, fetch, verify, convert them.",
+    subcommand_metavar="[PATTERN]... | VERB [ARGS]...",
 )
 
 
 @models_app.command("list", hidden=True)
 def list_command(
-    pattern: Annotated[str, typer.Argument(help="Name, variant or wildcards.")] = "*", as_json: Json = False
+    patterns: Annotated[
+        list[str] | None, typer.Argument(metavar="[PATTERN]...", help="Names, variants or wildcards.")
+    ] = None,
+    as_json: Json = False,
 ) -> None:
     """List checkpoints, those in the package first: kind, lidar, size, scores, whether it is on this machine.
 
-    A score is the share of episodes without a contact, and in brackets that which the suite counts as success.
+    A score is the share of episodes without a contact, and in brackets that which the suite counts as success. One
+    with * is of a network that was fed in another way than by default; models show NAME says how.
     """
     from navrep_data.zoo.fetching import Source, missing_here
     from navrep_data.zoo.names import default_tag
     from navrep_data.zoo.registry import find, list_models
 
     where = Source.of(None)
-    found = {find(name).name: find(name) for name in list_models(pattern)}
-    if not found:
-        raise ConfigError(f"No model matches {pattern!r}. List all: navrep-data models")
+    found: dict[str, Record] = {}
+    for pattern in patterns or ["*"]:
+        fitting = {find(name).name: find(name) for name in list_models(pattern)}
+        if not fitting:
+            raise ConfigError(f"No model matches {pattern!r}. List all: navrep-data models")
+        found |= fitting
     chosen = dict(sorted(found.items(), key=lambda item: not item[1].shipped))
     absent = {name: [entry.path for _, entry in missing_here(r, where)] for name, r in chosen.items()}
     if as_json:
@@ -69,15 +77,18 @@ def list_command(
         return
     width = max(map(len, chosen))
     suites = ("navreptest", "navrep27")
-    say(f"{'name':{width}}  {'kind':11}  {'lidar':5}  {'size':>7}  {'  '.join(f'{s:>13}' for s in suites)}  here")
+    say(f"{'name':{width}}  {'kind':11}  {'lidar':5}  {'size':>7}  {'  '.join(f'{s:>14}' for s in suites)}  here")
     for name, r in chosen.items():
         marks = "yes" if not absent[name] else f"no ({len(absent[name])} to fetch)"
         star = f"  = {r.variant}.released" if r.released and r.tag != "released" else ""
         if r.ours:
             star = f"  = {r.variant}, ours" if default_tag(r.variant) == r.tag else "  ours"
-        scores = "  ".join(f"{_score(r.results, suite):>13}" for suite in suites)
+        scores = "  ".join(f"{_score(r.results, suite):>14}" for suite in suites)
         say(f"{name:{width}}  {r.kind:11}  {r.lidar or '-':5}  {_size(r):>7}  {scores}  {marks}{star}")
-    say_err("scores: episodes without a contact, and as released in brackets; '-' = not measured")
+    say_err(
+        "scores: episodes without a contact, and as released in brackets; '-' = not measured, '*' = fed in another way "
+        "than by default: navrep-data models show NAME"
+    )
 
 
 def _size(record: Record) -> str:
@@ -88,23 +99,41 @@ def _size(record: Record) -> str:
 
 
 def _score(results: Sequence[dict[str, Any]], suite: str) -> str:
-    """Return success in a suite's default physics, rounds and feeding, without contacts and as released."""
-    from navrep_data.zoo.measured import main_result
+    """Return success in a suite's default physics and rounds, without contacts and as released.
+
+    A network that was never fed by default has that of another way of feeding, marked by ``*``.
+    """
+    from navrep_data.zoo.measured import main_result, other_result
 
     mine = main_result(results, suite, "original")
+    mark = "" if mine is not None else "*"
+    mine = other_result(results, suite, "original") if mine is None else mine
     if mine is None:
         return "-"
     free, released = (mine.get(key) for key in ("contact_free_rate", "success_rate"))
-    return ("-" if free is None else f"{100 * free:.1f}") + ("" if released is None else f" ({100 * released:.1f}) %")
+    share = "-" if free is None else f"{100 * free:.1f}"
+    return share + ("" if released is None else f" ({100 * released:.1f}) %") + mark
 
 
 @models_app.command("show")
-def show_command(name: Annotated[str, typer.Argument(metavar="NAME")], as_json: Json = False) -> None:
-    """Show what is known of a checkpoint: files, sizes, sensor, quirks, results."""
+def show_command(name: Annotated[str, typer.Argument(metavar="NAME|DIR")], as_json: Json = False) -> None:
+    """Show what is known of a checkpoint: files, sizes, sensor, quirks, results; of a folder, what its JSON says."""
     from navrep_data.zoo import show
     from navrep_data.zoo.cards import describe
     from navrep_data.zoo.fetching import Source, missing_here
+    from navrep_data.zoo.folders import place_of
 
+    place = place_of(name)
+    if place is not None:
+        from navrep_data.zoo.local import described
+
+        found = described(place)
+        if as_json:
+            print_json(found)
+        else:
+            for key, value in found.items():
+                say(f"{key}: {value if isinstance(value, str) else json.dumps(value)}")
+        return
     record = show(name)
     absent = [entry.path for _, entry in missing_here(record, Source.of(None))]
     if as_json:

@@ -6,10 +6,18 @@ import os
 from pathlib import Path
 from typing import Any
 
-from navrep_data.errors import CheckpointError
+from navrep_data.errors import CheckpointError, ModelNotFoundError
 from navrep_data.io import read_json
 from navrep_data.schema import SensorContract
-from navrep_data.zoo.folders import check_described, is_training, load_folder, place_of, trained_robot
+from navrep_data.zoo.folders import (
+    check_described,
+    is_training,
+    load_folder,
+    place_of,
+    policy_files,
+    read_policy,
+    trained_robot,
+)
 
 POLICY_FILE = "policy.json"
 """Beside a controller's weights: what it sees through."""
@@ -60,6 +68,30 @@ def load_any_model(name: str | os.PathLike[str], source: str | os.PathLike[str] 
     from navrep_data.models import checkpoint
 
     return checkpoint.load(path)
+
+
+def described(path: Path) -> dict[str, Any]:
+    """Return what the JSON at a place says of the model there, with the sizes of its files; no weights are read.
+
+    Raises
+    ------
+    ModelNotFoundError
+        If there is nothing.
+    CheckpointError
+        If it is no model of this package.
+    """
+    from navrep_data.models import checkpoint
+
+    if not path.exists():
+        raise ModelNotFoundError(f"There is no {path}, expected a folder with a checkpoint: check the path.")
+    if (path / POLICY_FILE).is_file() and not is_training(path):
+        found, files = read_policy(path), policy_files(path)
+    else:
+        found = checkpoint.read_config(path)
+        files = policy_files(path) or {file.name: file for file in checkpoint.paths(path) if file.is_file()}
+        if is_training(path):
+            found = {**found, "policy": read_json(path / POLICY_FILE, _MAX_JSON)}
+    return {"path": str(path), **found, "files": {name: file.stat().st_size for name, file in files.items()}}
 
 
 def load_policy(folder: Path, **options: Any) -> Any:

@@ -58,6 +58,12 @@ def main_result(results: Sequence[Entry], suite: str, physics: str) -> Entry | N
     return next((entry for entry in results if is_benchmark(entry) and key(entry) == wanted), None)
 
 
+def other_result(results: Sequence[Entry], suite: str, physics: str) -> Entry | None:
+    """Return the result of rounds from 0 that was fed in another way than by default: that of most episodes."""
+    found = [r for r in results if is_benchmark(r) and key(r)[:3] == (suite, physics, 0)]
+    return max(found, key=lambda r: int(r["episodes"]), default=None)
+
+
 def feeding(entry: Entry) -> str:
     """Return in words how a network was fed."""
     fed = (fed_as(entry) or BY_CONTRACT) if "ranges" in entry else _BEFORE_FEEDING

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import fnmatch
 import json
+import shlex
 import sys
 from collections.abc import Iterator
 from dataclasses import MISSING, asdict, dataclass, fields
@@ -19,7 +20,7 @@ from typing import Any
 
 from navrep_data.errors import UnknownNameError, did_you_mean
 from navrep_data.io import FileId
-from navrep_data.zoo.names import OWN, RELEASED, WILDCARDS, alias_line, default_tag, here_hint, split_name
+from navrep_data.zoo.names import OWN, RELEASED, WILDCARDS, alias_line, default_tag, here_hint, is_path, split_name
 
 KINDS = ("policy", "controller", "world_model", "vae", "memory")
 FOLDER = Path(__file__).parent
@@ -237,6 +238,11 @@ def find(name: str) -> Record:
     UnknownNameError
         If there is no such name, or several runs fit the tag.
     """
+    if is_path(name):
+        raise UnknownNameError(
+            f"{name!r} is a place, expected a name of the zoo: navrep-data models lists them, and navrep-data models "
+            f"show {shlex.quote(name)} tells what is there."
+        )
     variant, tag = split_name(name)
     runs = variants().get(variant)
     if runs is None:

@@ -9,6 +9,8 @@ import warm_process
 from recorded import golden as recorded_golden
 from recorded import write_golden
 
+from navrep_data.testing import tiny_checkpoint
+
 pytestmark = pytest.mark.slow  # seconds each; `make test` runs them
 
 E2E = "e2e_1d.20201026"
@@ -47,6 +49,33 @@ def test_list(run):
     assert ours.split()[:5] == ["e2e_1d.v1", "policy", "1d", "0.55", "MB"]
     assert re.search(r"\(68\.5\) % .* \(57\.4\) %  yes  = e2e_1d, ours$", ours)
     assert " rings " in run("modular_rings.v1").stdout
+
+
+def test_several_patterns_are_one_list(run):
+    found = json.loads(run("e2e_1d*", "transformer_1d_z*", "e2e_1d.v1", "--json").stdout)
+    names = [r["name"] for r in found]
+    assert len(names) == len(set(names))
+    assert {name.split("_")[0] for name in names} == {"e2e", "transformer"}
+    assert names[:2] == ["e2e_1d.v1", "transformer_1d_z.v1"]
+    done = run("e2e_1d*", "nothing*")
+    assert (done.returncode, done.stderr) == (2, "Error: No model matches 'nothing*'. List all: navrep-data models\n")
+
+
+def test_where_only_another_feeding_was_measured_that_is_shown_and_marked(run):
+    done = run("transformer_1d_z.20201015")
+    assert "  23.5 (23.5) %*  " in done.stdout
+    assert "'*' = fed in another way than by default" in done.stderr
+
+
+def test_show_takes_a_folder(run, tmp_path):
+    tiny_checkpoint(tmp_path / "mine", model="e2e")
+    done = run("show", "./mine", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "kind: e2e\n" in done.stdout
+    assert json.loads(run("show", "./mine", "--json", cwd=tmp_path).stdout)["kind"] == "e2e"
+    done = run("show", "./gone", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "Error: There is no gone, expected a folder with a checkpoint: check the path.\n"
 
 
 def test_list_tells_what_is_here(run, released):

@@ -1,16 +1,18 @@
 """What people type for a model: a bare word is a name of the zoo, whatever lies in the working folder."""
 
+import shlex
+
 import pytest
 
 from navrep_data import zoo
-from navrep_data.errors import PolicyError, UnknownNameError
+from navrep_data.errors import ModelNotFoundError, PolicyError, UnknownNameError
 from navrep_data.evaluate.policies import resolve_policy
 from navrep_data.evaluate.sources import full_name, weights_of
 from navrep_data.generate.policy import make_policy
 from navrep_data.models import VAE, EndToEnd
 from navrep_data.testing import tiny_checkpoint
 from navrep_data.zoo.folders import place_of
-from navrep_data.zoo.local import load_any_model
+from navrep_data.zoo.local import described, load_any_model
 
 
 @pytest.fixture
@@ -34,6 +36,27 @@ def test_the_zoo_wins_where_a_folder_has_its_name(here, load):
 def test_a_folder_named_by_a_bare_word_is_refused_with_what_to_write(here, find):
     with pytest.raises(UnknownNameError, match=r"There is a \./mine here: to name that, write \./mine"):
         find("mine")
+
+
+@pytest.mark.parametrize("place", ["./mine", "mine/model.safetensors", "./it's"])
+def test_a_place_is_not_told_to_be_written_as_a_place(here, place):
+    """What used to be said: There is a ././mine here: to name that, write ././mine."""
+    (here / "it's").mkdir()
+    with pytest.raises(UnknownNameError) as refused:
+        zoo.show(place)
+    assert "to name that, write" not in str(refused.value)
+    assert f"navrep-data models show {shlex.quote(place)} tells what is there" in str(refused.value)
+
+
+def test_a_place_is_described_without_its_weights(here):
+    found = described(here / "mine")
+    assert (found["kind"], list(found["files"])) == ("e2e", ["config.json", "model.safetensors"])
+    zoo.save_policy(zoo.load("./mine"), "saved")
+    (here / "saved" / "controller" / "model.safetensors").write_bytes(b"not read")
+    found = described(here / "saved")
+    assert (found["parts"], found["files"]["controller/model.safetensors"]) == (["controller"], 8)
+    with pytest.raises(ModelNotFoundError, match=r"There is no .*gone, expected a folder with a checkpoint"):
+        described(here / "gone")
 
 
 def test_places(here, monkeypatch):
