@@ -337,6 +337,7 @@ def test_from_the_command_line(nodes, tmp_path):
     assert tree(tmp_path / "d") == tree(tmp_path / "here")
 
 
+@pytest.mark.slow
 @needs_ray
 def test_no_cluster_there(tmp_path):
     with pytest.raises(

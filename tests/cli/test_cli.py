@@ -23,6 +23,7 @@ def dataset(tmp_path_factory):
     return root, done.stdout
 
 
+@pytest.mark.slow
 def test_generate_tells_plan_outcome_and_what_to_do_next(dataset):
     root, out = dataset
     lines = out.splitlines()

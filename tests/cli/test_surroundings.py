@@ -121,6 +121,7 @@ def test_an_unreadable_dataset(dataset, tmp_path, verb):
 LONG = "x" * 300
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -271,6 +272,7 @@ STARTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", STARTS)
 @pytest.mark.parametrize("at", ["navrep_data.cli.main", "typer", "navrep_data.cli.info", "run"])
 def test_ctrl_c_while_modules_are_imported_is_one_line(start, at):

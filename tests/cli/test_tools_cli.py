@@ -50,6 +50,7 @@ def test_filter_merge_and_verify(run, dataset, tmp_path):
     assert str(tmp_path) not in (tmp_path / "all" / "manifest.json").read_text()
 
 
+@pytest.mark.slow
 def test_split(run, dataset, tmp_path):
     code, out, _ = run("split", dataset, "--out", tmp_path / "s", "--json")
     assert code == 0
@@ -108,6 +109,7 @@ def test_errors_are_one_line(run, dataset, tmp_path, arguments, words):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_import_rosbag(run, tmp_path):
     pytest.importorskip("rosbags")
     import sys

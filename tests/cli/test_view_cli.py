@@ -40,6 +40,7 @@ def test_it_writes_a_page_and_prints_where(dataset, tmp_path):
     assert (tmp_path / "crowd.view.html").read_text().startswith(MARK)
 
 
+@pytest.mark.slow
 def test_sequences_out_size_and_json(dataset, tmp_path, capsys):
     target = tmp_path / "page.html"
     code, out, _ = run(capsys, "view", dataset, "--sequence", 1, "--sequence", 3, "--out", target, "--json")
@@ -60,6 +61,7 @@ def test_the_browser_opens_on_request_only(dataset, tmp_path, capsys, monkeypatc
     assert opened == [(tmp_path / "a.html").as_uri()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -56,6 +56,7 @@ def read(bag, out, **settings):
 # --- scans
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scan",
     [
@@ -77,6 +78,7 @@ def test_scans_whose_rays_vary(tmp_path, scan):
     assert np.abs(scans - 3.0).max() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [[], np.full(170, 3.0), np.full(2, np.nan)])
 def test_first_scans_that_are_short_or_empty(tmp_path, first):
     with Recorder(tmp_path / "bag", "ros2") as bag:
@@ -95,6 +97,7 @@ def test_two_scanners_on_one_topic_are_refused(tmp_path):
         read(bag, tmp_path / "d")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("far", [0.0, math.nan])
 def test_scans_that_do_not_say_how_far_they_reach(tmp_path, far):
     ranges = np.full(RAYS, 3.0)
@@ -162,6 +165,7 @@ def test_quaternions_of_zeros_are_no_orientation(tmp_path):
 # --- clocks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_recordings_in_bursts_go_by_the_headers_stamps(tmp_path, kind):
     """Messages arrive a second's worth at a time; when they were measured stands in their headers."""
@@ -178,6 +182,7 @@ def test_recordings_in_bursts_go_by_the_headers_stamps(tmp_path, kind):
     assert not np.isnan(state[2:, 0]).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stamps", "why"),
     [
@@ -205,6 +210,7 @@ def test_stamps_that_are_none(tmp_path, stamps, why):
 # --- frames
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_goals_in_another_frame_by_tf(tmp_path, kind):
     """map -> world is fixed, world -> odom drifts: the goal is where that was when it came, between two transforms."""
@@ -225,6 +231,7 @@ def test_goals_in_another_frame_by_tf(tmp_path, kind):
     np.testing.assert_allclose(state[known, 1], 0.0, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("transforms", "has"), [(False, "the bag has none"), (True, r"do not join them \(2 frames\)")])
 def test_goals_in_a_frame_that_nothing_joins(tmp_path, transforms, has):
     with Recorder(tmp_path / "bag", "ros2") as bag:
@@ -254,6 +261,7 @@ def test_mountings_that_the_bag_knows_better(tmp_path, mount):
 # --- topics that nobody reads
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["other_msgs/Thing thing\n", "uint8[] data\nencoder_msgs/Measure", "\x00%$"])
 @pytest.mark.parametrize("kind", KINDS[:2])
 def test_definitions_of_topics_that_are_not_used_do_not_matter(tmp_path, kind, text):

@@ -343,6 +343,7 @@ def test_batches_three_ways_are_equal(made):
     assert sum(len(b["mask"]) for b in DataLoader(dataset, sampler=sampler, batch_size=None)) == len(dataset)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preload", [False, True])
 def test_batches_that_are_kept_do_not_change(made, preload):
     """The memory of a batch is used again, but never while somebody holds the batch or a part of it."""

@@ -76,6 +76,7 @@ def test_the_card_gives_numbers_exactly(tmp_path):
     assert parse_mount(words[words.index("--mount") + 1]) == mount
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_bag(tmp_path, kind):
     """Goal at x = 2, known from 0.35 s, reached (nearer than 0.5 m) after x = 1.5 (3.0 s): in the row at 3.2 s."""
@@ -110,6 +111,7 @@ def test_a_bag(tmp_path, kind):
     assert len(SequenceDataset(tmp_path / "d", "1d", window=8))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS[:2])
 def test_scans_are_seen_from_the_robot(tmp_path, kind):
     """360 rays from straight behind become 1080 from straight ahead; invalid is 0, nothing is range_max."""

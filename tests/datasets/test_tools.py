@@ -201,6 +201,7 @@ def test_filter(few, tmp_path, conditions, fits):
     assert len(SequenceDataset(tmp_path / "out", "1d", window=8, split="train"))
 
 
+@pytest.mark.slow
 def test_crowds_are_known_without_the_humans_column(tmp_path):
     generate(n=3, out=tmp_path / "d", length=120, humans=4, obstacles=2, humans_column=False)
     generate(n=3, out=tmp_path / "with", length=120, humans=4, obstacles=2)
@@ -240,6 +241,7 @@ def test_rows_do_not_come_twice(few, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_one_sequence_on_two_sides_is_refused(few, tmp_path):
     filter(few, tmp_path / "goals", outcomes=["goal"])
     filter(few, tmp_path / "rest", outcomes=[n for n in EVENT_NAMES[1:] if n != "goal"])
@@ -362,6 +364,7 @@ def test_damage_does_not_get_a_right_hash(few, tmp_path):
         shutil.rmtree(root)
 
 
+@pytest.mark.slow
 def test_nothing_is_written_in_place_or_over_something(few, tmp_path):
     root = shutil.copytree(few, tmp_path / "few")
     (tmp_path / "notes").write_text("mine")
@@ -445,6 +448,7 @@ def test_merge_wants_two_finished_datasets(few, tmp_path):
         merge([few, unfinished], tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_parts_are_tools_food_and_parts_of_results_know_their_source(few, many, tmp_path, monkeypatch):
     monkeypatch.setattr(_pieces, "TARGET_SHARD_ROWS", 2 * ROWS)
     part = shutil.copytree(few, tmp_path / "part")
@@ -504,6 +508,7 @@ def test_generate_leaves_results_alone(few, tmp_path):
         regenerate(tmp_path / "out", 1)
 
 
+@pytest.mark.slow
 def test_shards_are_neither_tiny_nor_too_large(few, tmp_path, monkeypatch):
     monkeypatch.setattr(_pieces, "TARGET_SHARD_ROWS", 2 * ROWS)
     manifest = filter(few, tmp_path / "out", min_steps=1)
@@ -514,6 +519,7 @@ def test_shards_are_neither_tiny_nor_too_large(few, tmp_path, monkeypatch):
     assert filter(few, tmp_path / "small", min_steps=1).shard_size == 1
 
 
+@pytest.mark.slow
 def test_stats(few):
     whole = stats(few)
     manifest = Manifest.read(few)
@@ -556,6 +562,7 @@ def test_sample(few, tmp_path):
         sample(few, tmp_path / "a", n=1)
 
 
+@pytest.mark.slow
 def test_imports_have_no_worlds_and_go_through_all_tools(tmp_path):
     from test_import_npz import sequence, write
 
@@ -585,6 +592,7 @@ def test_descriptions(few, tmp_path):
     assert sum(found["splits"].values()) == found["sequences"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [np.int64, np.array, torch.tensor])
 def test_bounds_and_seeds_are_whole_numbers_of_any_kind(few, tmp_path, kind):
     plain, other = filter(few, tmp_path / "a", min_steps=2), filter(few, tmp_path / "b", min_steps=kind(2))

@@ -81,6 +81,7 @@ def test_an_end_is_not_lost_with_the_frame_that_told_of_it(tmp_path):
         assert arrays["dones"].tolist() == [False] * (len(arrays["dones"]) - 1) + [True]
 
 
+@pytest.mark.slow
 def test_generated_rows_survive_export_and_import(generated, tmp_path):
     export(generated, tmp_path / "out", format="npz")
     import_npz(tmp_path / "out", tmp_path / "again")

@@ -64,6 +64,7 @@ def test_a_sound_dataset(sound, tmp_path):
     assert problems(rebuilt(sound, tmp_path / "again", lambda *_: None)) == []
 
 
+@pytest.mark.slow
 def test_rows_in_two_splits(sound, tmp_path):
     first = {}
 
@@ -182,6 +183,7 @@ def test_a_goal_that_was_not_reached(sound, tmp_path):
     assert any(check == "goal" and "ends as 'goal'" in what for check, _, what in found)
 
 
+@pytest.mark.slow
 def test_a_reset_out_of_line(sound, tmp_path):
     def change(k, columns, worlds):
         worlds["robot_start"][0] += (0.5, 0.0, 0.0)
@@ -191,6 +193,7 @@ def test_a_reset_out_of_line(sound, tmp_path):
     assert "starts 0.50 m and 0.00 rad from the start" in found[0][2]
 
 
+@pytest.mark.slow
 def test_a_reset_without_is_first(sound, tmp_path):
     """A robot that is somewhere else in the middle of an episode: its goal stays in place, so only motion tells."""
 
@@ -211,6 +214,7 @@ def test_a_reset_without_is_first(sound, tmp_path):
     assert any("a reset without is_first?" in what for _, _, what in found)
 
 
+@pytest.mark.slow
 def test_without_poses_goals_are_still_looked_at(sound, tmp_path):
     def change(k, columns, worlds):
         columns["robot_pose"][:] = np.nan
@@ -238,6 +242,7 @@ def test_damage_is_told_and_the_rest_still_checked(sound, tmp_path):
     assert report.sequences == 2
 
 
+@pytest.mark.slow
 def test_many_findings_are_counted(sound, tmp_path, monkeypatch):
     monkeypatch.setattr("navrep_data.doctor.dataset.MAX_FINDINGS", 1)
 

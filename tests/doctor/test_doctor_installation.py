@@ -181,6 +181,7 @@ def test_offline_is_told(monkeypatch):
     assert (check.status, "switched off by NAVREP_DATA_OFFLINE" in check.what) == ("note", True)
 
 
+@pytest.mark.slow
 def test_the_command(monkeypatch, capsys):
     ok, bad = installation.Check("a", "ok", "1.0"), installation.Check("b", "problem", "is gone: get it")
     for checks, code, last in (([ok], 0, "all well"), ([ok, bad], 1, "1 problems")):

@@ -87,6 +87,7 @@ def resize(image, size):
     return np.asarray(Image.fromarray(image).resize(size))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:pkg_resources is deprecated:UserWarning")  # where pygame finds old setuptools
 def test_a_window_shows_the_environments(monkeypatch):
     pygame = pytest.importorskip("pygame")
@@ -158,6 +159,7 @@ def pickled(env):
     return pickle.loads(pickle.dumps(env))  # noqa: S301  our own
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [copy.deepcopy, pickled])
 @pytest.mark.parametrize("env", ["navrep-train", "navrep-test", param("ian")])
 def test_copies_go_on_alike(env, how):

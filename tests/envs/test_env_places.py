@@ -122,6 +122,7 @@ def test_places_on_people_and_of_several_robots_are_refused():
         sim.place([[0.0, 0.0, 0.0]], [1.0, 1.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", [param("ian")])
 def test_scenarios_take_starts_but_no_goals(env):
     world = make(env)

@@ -182,6 +182,7 @@ def test_mcnemar_is_the_exact_binomial():
         assert mcnemar(b, c) == pytest.approx(min(1.0, 2 * tail))
 
 
+@pytest.mark.slow
 def test_pairs_count_discordant_episodes_and_bootstrap_whole_scenarios(maps):
     a, b = made_up("a", "S" * 54, range(27, 54), "navrep27"), made_up("b", "S" * 27 + "C" * 27, (), "navrep27")
     (pair,) = compare([a, b])

@@ -149,6 +149,7 @@ def test_the_table_names_runs_fed_as_the_authors_do_it(measured):
     assert {s["source"] for s in done.sources if s["name"] == "e2e_1d"} == {"released_as_fed", "released", "authors"}
 
 
+@pytest.mark.slow
 def test_figures_name_runs_fed_as_the_authors_do_it_and_draw_each_policy_once(measured, maps, monkeypatch):
     from navrep_data.evaluate.reproduce import testing
 
@@ -196,6 +197,7 @@ def test_world_models_are_compared_on_the_same_rows_only(tmp_path):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_training_curves(tmp_path):
     for name, rates in (("a_z", [0.1, 0.4, 0.3]), ("deep/b_zh", [0.2, 0.2, 0.5])):
         folder = tmp_path / name

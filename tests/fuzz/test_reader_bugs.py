@@ -80,6 +80,7 @@ def test_millions_of_empty_lists_are_not_parsed(tmp_path):
     refused(lambda: read_json(tmp_path / "a.json"), CorruptDataError, "1,000,001 lists and objects", megabytes=16)
 
 
+@pytest.mark.slow
 @of("manifest")
 def test_a_manifest_that_is_nested_as_deep_as_python_parses(files):
     values = json.loads((files / "manifest.json").read_bytes())
@@ -211,6 +212,7 @@ def test_aliases_that_stand_for_billions_of_values(files, merge):
         refused(lambda: load_map(files / "pgm.yaml"), MapError, "it has an alias")
 
 
+@pytest.mark.slow
 @of("map")
 @pytest.mark.parametrize(
     "value", ["!!int ''", "!!float ''", "!!timestamp x", "!!bool x", "0x" + "f" * 20_000, "[0x" + "f" * 20_000 + "]"]
@@ -237,6 +239,7 @@ def packed(members, method=zipfile.ZIP_DEFLATED):
     return buffer.getvalue()
 
 
+@pytest.mark.slow
 def test_npz_files_that_claim_or_unpack_too_much():
     """Sizes in headers are compared with bytes that are there before anything is made of them."""
     head = "{'descr': '%s', 'fortran_order': False, 'shape': %s}"

@@ -110,6 +110,7 @@ def test_running_again_does_nothing(reference, tmp_path):
     assert tree(root) == reference[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop_after", [0, 1, 3])
 def test_an_interrupted_run_goes_on(reference, tmp_path, monkeypatch, stop_after):
     root = tmp_path / "d"
@@ -132,6 +133,7 @@ def test_an_interrupted_run_goes_on(reference, tmp_path, monkeypatch, stop_after
     assert tree(root) == reference[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("harm", ["truncate", "delete", "flip", "worlds"])
 def test_a_damaged_shard_is_made_again(reference, tmp_path, harm):
     root = tmp_path / "d"
@@ -149,6 +151,7 @@ def test_a_damaged_shard_is_made_again(reference, tmp_path, harm):
     assert tree(root) == reference[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut", [0, 1, 500])
 def test_a_cut_manifest_is_made_again(reference, tmp_path, cut):
     root = tmp_path / "d"

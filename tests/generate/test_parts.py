@@ -71,6 +71,7 @@ def test_what_is_no_range_is_refused(text):
         parse_part(text)
 
 
+@pytest.mark.slow
 def test_merged_parts_are_the_dataset_of_one_run(root, whole):
     merged = merge_manifest(root)
     assert merged.complete

@@ -45,6 +45,7 @@ def test_a_true_dataset_is_equal_to_the_byte(dataset):
     assert report.ok
 
 
+@pytest.mark.slow
 def test_the_choice_can_be_repeated(dataset):
     chosen = [[c.sequence for c in regenerate(dataset, 2, seed=s).comparisons] for s in (1, 1, 2, 3, 4)]
     assert chosen[0] == chosen[1]
@@ -118,6 +119,7 @@ def test_what_has_no_recipe_is_refused(dataset, tmp_path):
             regenerate(dataset, k)
 
 
+@pytest.mark.slow
 def test_command_line(dataset, capsys):
     from navrep_data.cli.main import run
 

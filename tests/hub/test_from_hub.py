@@ -60,6 +60,7 @@ def test_from_hub_is_the_dataset(hub, pushed, template, cls):
     assert hub.count(SHARD, "GET") == before  # it is in huggingface_hub's cache
 
 
+@pytest.mark.slow
 def test_from_hub_brings_the_shards_of_the_split_alone(hub, pushed, template):
     there = SequenceDataset.from_hub(REPO, "1d", split="val", window=8)  # sequence 1, in the first of three shards
     assert hub.count(SHARD, "GET") == 2  # and its worlds
@@ -67,6 +68,7 @@ def test_from_hub_brings_the_shards_of_the_split_alone(hub, pushed, template):
     assert there.provenance["partial"] is True
 
 
+@pytest.mark.slow
 def test_from_hub_offline(hub, pushed, monkeypatch):
     monkeypatch.setenv("NAVREP_DATA_OFFLINE", "1")
     with pytest.raises(OfflineError, match="NAVREP_DATA_OFFLINE=1"):
@@ -96,6 +98,7 @@ def test_a_damaged_file_in_the_cache_is_replaced(hub, pushed, template):
     assert hub.count(SHARD, "GET") == 7
 
 
+@pytest.mark.slow
 def test_a_wrong_shard_never_opens(hub, pushed):
     hub.faults = [Fault("flip", SHARD, "GET", times=1000)]
     with pytest.raises(CorruptDataError, match=r"does not have its SHA-256 .* twice. It was not kept"):
@@ -104,6 +107,7 @@ def test_a_wrong_shard_never_opens(hub, pushed):
     assert len(SequenceDataset.from_hub(REPO, "1d", window=8))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("revision", few([None, "v1"], 1))
 def test_a_revision_is_what_it_was(hub, pushed, template, revision):
     """A branch that moves changes nothing for who pinned a commit, or has opened the dataset."""
@@ -161,6 +165,7 @@ def test_streaming_yields_the_windows_of_the_dataset(hub, pushed, template):
     assert stream.provenance["revision"] == pushed.commit
 
 
+@pytest.mark.slow
 def test_streaming_reads_only_the_shards_it_needs(hub, pushed, template):
     stream = StreamingSequenceDataset.from_hub(REPO, "1d", window=8, split="val", fields=["sequence", "step"])
     assert windows(stream) == windows(
@@ -169,6 +174,7 @@ def test_streaming_reads_only_the_shards_it_needs(hub, pushed, template):
     assert hub.count(SHARD, "GET") == 1
 
 
+@pytest.mark.slow
 def test_streaming_fetches_ahead_in_the_order_of_the_epoch(hub, pushed):
     stream = StreamingSequenceDataset.from_hub(REPO, "1d", window=8, shuffle=False, buffer_sequences=2, prefetch=1)
     first = iter(stream)
@@ -224,6 +230,7 @@ def test_a_cache_that_is_too_small_is_refused(hub, pushed, template):
         StreamingSequenceDataset.from_hub(REPO, "1d", window=8, cache_bytes=0)
 
 
+@pytest.mark.slow
 def test_a_reservation_of_a_killed_process_is_taken_back(hub, pushed, template, tmp_path):
     sizes = shard_bytes(template)
     folder = tmp_path / "navrep-home" / "hub" / "shards"
@@ -250,6 +257,7 @@ def test_streaming_in_workers(hub, pushed, template, monkeypatch, start):
     assert hub.count(SHARD, "GET") == 3
 
 
+@pytest.mark.slow
 def test_streaming_without_an_index_reads_every_shard_once(hub, pushed, template, monkeypatch):
     files = hub.repo(REPO).files()
     plain = Manifest.read(template)
@@ -309,6 +317,7 @@ def test_a_shard_that_cannot_be_had_is_an_error_of_the_stream(hub, pushed):
     assert len(list(stream)) == stream.windows_per_epoch
 
 
+@pytest.mark.slow
 def test_a_stream_can_be_pickled(hub, pushed):
     stream = StreamingSequenceDataset.from_hub(REPO, "1d", window=8)
     a = next(iter(stream))

@@ -178,6 +178,7 @@ def test_a_policy_goes_up_and_comes_down(hub, tmp_path, features):
         zoo.load(f"hf://{REPO}")
 
 
+@pytest.mark.slow
 def test_a_trainings_folder_goes_up_as_a_policy(hub, tmp_path):
     """What ``train controller`` writes: the controller's weights at the top, its world model in a folder."""
     policy, folder = a_policy("z"), tmp_path / "training"
@@ -190,6 +191,7 @@ def test_a_trainings_folder_goes_up_as_a_policy(hub, tmp_path):
     np.testing.assert_array_equal(actions(zoo.load(f"hf://{REPO}")), actions(policy))
 
 
+@pytest.mark.slow
 def test_another_model_leaves_nothing_of_the_first(hub, tmp_path):
     zoo.save_policy(a_policy(), tmp_path / "p")
     push_model(tmp_path / "p", REPO, license="mit")
@@ -224,6 +226,7 @@ def test_cut_connections(hub, tmp_path, every):
     same_weights(zoo.load(f"hf://{REPO}").network, checkpoint.load(tmp_path / "m"))
 
 
+@pytest.mark.slow
 def test_wrong_weights(hub, tmp_path):
     checkpoint.save(world_model(), tmp_path / "m")
     push_model(tmp_path / "m", REPO, license="mit")
@@ -251,6 +254,7 @@ def test_only_what_loads_is_published(hub, tmp_path):
     assert hub.seen == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("files", "words"),
     few(

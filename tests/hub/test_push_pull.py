@@ -121,6 +121,7 @@ def test_what_was_pulled_goes_up_again_as_it_is(hub, pushed, tmp_path):
     assert push(got.root, "user/copy").commit == again.commit  # nothing changed: no commit
 
 
+@pytest.mark.slow
 def test_uploads_are_not_repeated(hub, template, pushed):
     assert len(hub.uploads) == 6
     push(template, REPO, license="mit")  # another licence, another card
@@ -128,6 +129,7 @@ def test_uploads_are_not_repeated(hub, template, pushed):
     assert b"license: mit" in hub.repo(REPO).files()["README.md"]
 
 
+@pytest.mark.slow
 def test_a_smaller_version_leaves_nothing_behind_and_spares_what_is_not_ours(hub, template, tmp_path):
     push(template, REPO, license="mit")
     repo = hub.repo(REPO)
@@ -261,6 +263,7 @@ def test_a_damaged_copy_is_mended(hub, pushed, template, tmp_path):
     assert hub.count(LARGE, "GET") == 2
 
 
+@pytest.mark.slow
 def test_no_room(hub, pushed, tmp_path, monkeypatch):
     small = types.SimpleNamespace(disk_usage=lambda _: types.SimpleNamespace(free=1000), rmtree=shutil.rmtree)
     monkeypatch.setattr(module, "shutil", small)
@@ -334,6 +337,7 @@ def test_a_connection_cut_once_after_any_byte(hub, pushed, template, tmp_path, a
     check_whole(pull(REPO, tmp_path / "got").root, template)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", few([1, 2], 1))
 def test_one_wrong_file_is_fetched_again(hub, pushed, template, tmp_path, times):
     hub.faults = [Fault("flip", LARGE, "GET", times=times)]
@@ -372,6 +376,7 @@ def test_busy_servers_are_asked_again(hub, pushed, template, tmp_path, quick, pa
         assert any(7 <= pause <= 8 for pause in quick)  # as long as it asks for
 
 
+@pytest.mark.slow
 def test_a_server_that_stays_busy(hub, pushed, tmp_path):
     hub.faults = [Fault("status", r"^/api/datasets", times=1000, status=429, headers={"Retry-After": "1"})]
     with pytest.raises(HubError, match=r"Gave up after 5 attempts .*: the Hub answers 429; it asks to come back in 1"):
@@ -404,6 +409,7 @@ def test_nobody_listens(hub, tmp_path, monkeypatch):
         pull(REPO, tmp_path / "got")
 
 
+@pytest.mark.slow
 def test_a_revision_that_moves_while_it_is_pulled(hub, pushed, template, tmp_path):
     make_dataset(tmp_path / "new", 6, 2, 30)
 
@@ -418,6 +424,7 @@ def test_a_revision_that_moves_while_it_is_pulled(hub, pushed, template, tmp_pat
         pull(REPO, tmp_path / "other")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("status", "words"),
     few(
@@ -463,6 +470,7 @@ def test_refusals_on_the_way_are_one_line(hub, pushed, template, tmp_path, path,
     check_whole(pull(REPO, tmp_path / "got").root, template)
 
 
+@pytest.mark.slow
 def test_a_wrong_token(hub, pushed, template, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_TOKEN", "hf_wrong")
     with pytest.raises(HubError, match=r"or the token is not accepted; log in with `hf auth login`, or set HF_TOKEN"):
@@ -515,12 +523,14 @@ def test_a_manifest_that_is_too_large(hub, pushed, tmp_path, monkeypatch):
     assert hub.count("/resolve/") == 0
 
 
+@pytest.mark.slow
 def test_a_repository_without_a_dataset(hub, pushed, tmp_path):
     hub.repo(REPO).commit("main", {"README.md": b"x"})
     with pytest.raises(DatasetNotFoundError, match=r"has no manifest.json, expected a dataset from `navrep-data push`"):
         pull(REPO, tmp_path / "got")
 
 
+@pytest.mark.slow
 def test_a_server_that_sends_without_end(hub, pushed, tmp_path, monkeypatch):
     """It announces the right size and sends more, without a length; what it sends is bounded."""
     shard = hub.repo(REPO).files()["data/shard-00000.h5"]
@@ -584,6 +594,7 @@ def test_push_goes_on_after_a_failure(hub, template, tmp_path, impatient, fault)
     check_whole(got.root, template)
 
 
+@pytest.mark.slow
 def test_a_commit_whose_answer_is_lost_is_made_once(hub, template, tmp_path, monkeypatch):
     import hub_server
 
@@ -602,6 +613,7 @@ def test_a_commit_whose_answer_is_lost_is_made_once(hub, template, tmp_path, mon
     check_whole(pull(REPO, tmp_path / "got").root, template)
 
 
+@pytest.mark.slow
 def test_a_push_that_fails_publishes_nothing_and_goes_on_later(hub, template, tmp_path):
     hub.faults = [Fault("status", r"^/lfs/", "PUT", times=1000, after=4, status=403)]
     with pytest.raises(HubError, match="the token may not do that"):
@@ -616,6 +628,7 @@ def test_a_push_that_fails_publishes_nothing_and_goes_on_later(hub, template, tm
     check_whole(pull(REPO, tmp_path / "got").root, template)
 
 
+@pytest.mark.slow
 def test_somebody_else_pushes_meanwhile(hub, template):
     push(template, REPO, license="mit")
     other = {**hub.repo(REPO).files(), "notes.md": b"mine"}

@@ -73,6 +73,7 @@ def test_what_fails_leaves_it_as_it_was(place, tmp_path, monkeypatch):
     assert not list(tmp_path.rglob("*.part"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", range(len(NAMES)))
 def test_killed_while_it_is_filled_it_holds_no_dataset(tmp_path, after):
     program = (

@@ -22,6 +22,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "config"), CASES, ids=lambda v: str(v))
 def test_what_is_saved_is_loaded(tmp_path, kind, config):
     module = checkpoint.make(kind, config)

@@ -62,6 +62,7 @@ def test_ranges_are_not_rounded_before_the_first_layer(scans):
     assert float(off.max()) <= 0.501
 
 
+@pytest.mark.slow
 @needs_int8
 def test_the_same_calibration_gives_the_same_encoder_in_any_batch(scans):
     vae = small_vae("rings")

@@ -327,6 +327,7 @@ def test_a_part_of_a_dataset_is_a_dataset_that_says_so(six):
         assert folder.provenance["partial"] is True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("asked", "chosen"),
     [

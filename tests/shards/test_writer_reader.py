@@ -46,6 +46,7 @@ def equal(a, b) -> bool:
     return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize(
     ("rows", "length"), [([100, 100], 100), ([7] * 9, 7), ([997], 997), ([1], 1), ([30, 2, 61], 61)]
@@ -169,6 +170,7 @@ def test_inflate_is_bounded_and_checked():
         inflate(data[:-3], 8000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "match"),
     [
@@ -275,6 +277,7 @@ def replace_by_link(link):
     return change
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "match"),
     [

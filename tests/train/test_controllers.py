@@ -95,6 +95,7 @@ def test_worlds_are_the_simulators_with_their_codes():
     assert (worlds.simulator.difficulty() <= [5, 10]).all()
 
 
+@pytest.mark.slow
 def test_progress_is_paid_on_steps_that_end_nothing():
     policy = Policy(Controller(ControllerConfig(21)), "z", "1d", None, world_model())
     config = make_config("navrep-train", physics="consistent")
@@ -166,6 +167,7 @@ def test_worlds_start_easy_or_hard(easy, expected, few_episodes, tmp_path):
     assert (run.worlds.difficulty() == expected).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("least", [0.05, 0.3])
 def test_the_width_of_actions_stays_within_its_bounds(least, few_episodes, tmp_path):
     recipe = default_controller_recipe("z", "1d").replace(**SMALL, least_std=least)
@@ -439,6 +441,7 @@ def test_the_authors_settings_run_and_report_the_episodes_they_did_not_select_on
     assert (kept["success_rate"], kept["step"]) == (0.4, 192)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("make", "scale"), [(default_controller_recipe, 1 / 32), (original_controller_recipe, 1.0)])
 def test_only_our_own_end_to_end_training_scales_ranges(make, scale):
     recipe = make("e2e", "1d").replace(worlds=2, rollout=4, batch=8)

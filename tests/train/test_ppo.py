@@ -84,6 +84,7 @@ def test_a_rollout_is_what_the_worlds_gave(parts):
     np.testing.assert_array_equal(ppo._last_episode_starts, starts)
 
 
+@pytest.mark.slow
 def test_a_rollout_does_not_depend_on_the_groups(parts):
     torch.manual_seed(0)
     whole, split = started(parts, 1), started(parts, 3)

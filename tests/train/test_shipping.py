@@ -104,6 +104,7 @@ def test_shipped_weights_load_by_name_offline_and_say_whose_they_are(trained, pa
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_output_folders_load_by_path(trained, dataset, tmp_path):
     policy = zoo.load(trained / "c")
     assert (policy.name, policy.features, policy.context) == ("c", "z", None)
@@ -117,6 +118,7 @@ def test_output_folders_load_by_path(trained, dataset, tmp_path):
     assert zoo.load(trained / "w").z_size == 16
 
 
+@pytest.mark.slow
 def test_the_world_model_is_stored_once_in_half_precision(trained, package, dataset):
     w, c = ship(trained, package, dataset)
     files = sorted(str(p.relative_to(package)) for p in (package / "weights").rglob("*") if p.is_file())
@@ -130,6 +132,7 @@ def test_the_world_model_is_stored_once_in_half_precision(trained, package, data
     assert str(trained) not in text, "no path of this machine"
 
 
+@pytest.mark.slow
 def test_the_record_says_how_it_was_made(trained, package, dataset):
     w, c = ship(trained, package, dataset)
     assert registry.records()[w.name] == w
@@ -150,6 +153,7 @@ def test_the_record_says_how_it_was_made(trained, package, dataset):
     assert recipe["machine"] == w.training["machine"]
 
 
+@pytest.mark.slow
 def test_stages_before_count(trained, package, dataset):
     recipes = package.parent / "recipes"
     options = {"commands": ["a", "b"], "root": package, "recipes": recipes}
@@ -208,6 +212,7 @@ def test_names_lists_and_checks_know_them(trained, package, dataset, capsys):
     assert [line.split("  = ")[1] for line in lines if line.startswith(c.name)] == [f"{VARIANT}_z, ours"]
 
 
+@pytest.mark.slow
 def test_a_damaged_file_is_refused(trained, package, dataset):
     w, c = ship(trained, package, dataset)
     path = package / w.files[0].path

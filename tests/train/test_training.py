@@ -409,6 +409,7 @@ def test_codes_of_blind_rays_are_those_that_v_was_trained_with(tmp_path):
     torch.testing.assert_close(found["mu"][found["mask"]], mu, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_encoding_rings_equals_windows_of_rings(dataset, tmp_path):
     torch.manual_seed(1)
     vae = VAE(VAEConfig("rings", 4))

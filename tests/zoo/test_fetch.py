@@ -52,6 +52,7 @@ def site(monkeypatch):
         yield running
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [PATH, "W/navreptraingpt", "navreptraingpt"])
 @pytest.mark.parametrize("by", ["sha256", "git"])
 @pytest.mark.parametrize("how", ["source", "variable"])
@@ -198,6 +199,7 @@ def test_fetch_brings_policy_and_parts(released, home):
     assert wrong == []
 
 
+@pytest.mark.slow
 def test_fetch_over_http_then_load_offline(released, home, monkeypatch):
     source = released / "models"
     names = ["W/navreptraingpt1d", "gym/navreptrainencodedenv_2020_10_15__09_18_59_PPO_GPT1D_V_ONLY_V64M64_ckpt.zip"]

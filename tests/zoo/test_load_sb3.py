@@ -70,6 +70,7 @@ def test_end_to_end_networks_learn(lidar):
     assert moved(before, model)
 
 
+@pytest.mark.slow
 def test_any_navrep_environment_can_be_set(tmp_path):
     """What used to fail: actions of three numbers, and another number of worlds than 6."""
     model = to_sb3(with_memory(), **FEW)

@@ -58,6 +58,7 @@ def test_policies_are_the_same_whatever_torchs_defaults_are(name, other_settings
     assert kinds == {(torch.float32, "cpu", False)}
 
 
+@pytest.mark.slow
 def test_the_default_is_put_back(other_settings):
     before = torch.get_default_dtype(), torch.get_default_device()
     zoo.load(NAMES[0])
@@ -102,6 +103,7 @@ def three_threads():
     torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 def test_a_benchmark_plays_on_one_thread_and_puts_the_number_back(tmp_path, three_threads):
     seen = []
     benchmark(
