@@ -9,6 +9,8 @@ import pytest
 
 # Networks here are small and test processes share the cores: threads that wait for each other would take half of them.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Tests start many processes; where bytecode may not be kept, each of them would compile the package again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.path.insert(0, str(Path(__file__).parent / "no_network"))
 
 import hypothesis

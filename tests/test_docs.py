@@ -150,6 +150,7 @@ def parse(command, name, args, parent=None):
     return context
 
 
+@pytest.mark.slow
 def test_commands_parse():
     commands = commands_named()
     assert len(commands) >= 25

@@ -77,6 +77,7 @@ def test_what_is_here():
 CODE = f"import socket; socket.create_connection(('{ELSEWHERE}', 9), 1)"
 
 
+@pytest.mark.slow
 def test_processes_that_tests_start_are_refused_too(tmp_path):
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 1
@@ -89,6 +90,7 @@ def test_processes_that_tests_start_are_refused_too(tmp_path):
     assert "NetworkBlockedError" in done.stderr
 
 
+@pytest.mark.slow
 def test_workers_are_refused_too():
     with (
         multiprocessing.get_context("spawn").Pool(1) as pool,

@@ -52,6 +52,7 @@ def test_sequences_out_size_and_json(dataset, tmp_path, capsys):
     assert "left out: sequence 0: rows " in err
 
 
+@pytest.mark.slow
 def test_the_browser_opens_on_request_only(dataset, tmp_path, capsys, monkeypatch):
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
@@ -90,6 +91,7 @@ def test_errors_are_one_line(dataset, tmp_path, capsys, arguments, words):
     assert len(err.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_dataset_of_the_hub_brings_the_shards_it_needs(dataset, tmp_path, capsys, monkeypatch):
     pulled = []
 

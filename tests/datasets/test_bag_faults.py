@@ -112,6 +112,7 @@ def test_scans_that_do_not_say_how_far_they_reach(tmp_path, far):
     assert scans[0, 0] == 7.0
 
 
+@pytest.mark.slow
 def test_blind_sectors_are_said_once_and_declared(tmp_path):
     """The scanner's body hides 90 degrees, the driver says NaN there; some rays say nothing now and then."""
 
@@ -149,6 +150,7 @@ def test_quaternions_of_any_length(tmp_path, length):
     np.testing.assert_allclose(rows_of(tmp_path / "d", "robot_pose")[0][:, 2], 1.2, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_quaternions_of_zeros_are_no_orientation(tmp_path):
     with Recorder(tmp_path / "bag", "ros2") as bag:
         drive_along(bag, length=0.0)
@@ -246,6 +248,7 @@ def test_goals_in_a_frame_that_nothing_joins(tmp_path, transforms, has):
     assert read(bag, tmp_path / "d", assume_same_frame=True)[0].rows == 13
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", [None, (0.25, 0.1, 1.5)])
 def test_mountings_that_the_bag_knows_better(tmp_path, mount):
     with Recorder(tmp_path / "bag", "ros1") as bag:
@@ -321,6 +324,7 @@ def test_notes_are_one_line_of_bounded_length(tmp_path):
     assert "ros2 bag reindex" in line
 
 
+@pytest.mark.slow
 def test_split_recordings_without_metadata(tmp_path):
     """Two files of one recording are read as one."""
     for k in (0, 1):

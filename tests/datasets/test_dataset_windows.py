@@ -181,6 +181,7 @@ def test_leading_of_an_import_is_the_stored_one(tmp_path):
     assert batch["action_valid"].sum(1).tolist() == [10, 20]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preload", [False, True])
 @pytest.mark.parametrize("action", ["taken", "leading"])
 def test_across_episodes_is_the_papers_rule(made, action, preload):
@@ -237,6 +238,7 @@ def test_no_default_window_crosses_an_episode(made):
             assert not window["is_last"][real][:-1].any()
 
 
+@pytest.mark.slow
 def test_every_row_comes_once_and_splits_are_disjoint(made):
     root, contents = made
     seen = {}
@@ -429,6 +431,7 @@ NUMBERS = [3, np.int64(3), np.uint8(3), np.array(3), torch.tensor(3), torch.tens
 NO_NUMBERS = [3.0, True, np.True_, np.float32(3), torch.tensor(3.0), torch.tensor(True), "3", None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", NUMBERS, ids=repr)
 def test_whatever_is_a_whole_number_is_an_index(made, number):
     """Samplers and ``torch.randint`` hand out tensors without axes, numpy its own integers."""
@@ -441,6 +444,7 @@ def test_whatever_is_a_whole_number_is_an_index(made, number):
     assert whole_number(number) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", NO_NUMBERS, ids=repr)
 def test_what_is_none_is_refused(made, number):
     dataset = SequenceDataset(made[0], lidar="1d", window=8)

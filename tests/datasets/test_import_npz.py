@@ -125,6 +125,7 @@ def test_rays_that_saw_nothing_in_any_file_are_declared(tmp_path):
     assert "blind_rays" not in import_npz(write(tmp_path / "other", sequence()), tmp_path / "seen").config
 
 
+@pytest.mark.slow
 def test_timeouts(tmp_path):
     source = sequence(400, ends=(175, 351, 399), unplayed=(), goals=(351,), crashes=())
     import_npz(write(tmp_path / "in", source), tmp_path / "out")
@@ -295,6 +296,7 @@ def test_pickles_are_not_loaded(tmp_path):
     assert not (tmp_path / "pwned").exists()
 
 
+@pytest.mark.slow
 def test_too_large_is_refused_before_it_is_read(tmp_path):
     """A bomb: 60 honest rows in the other arrays, and a header that promises far more than fits in memory."""
     folder = write(tmp_path / "in", sequence())

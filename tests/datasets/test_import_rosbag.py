@@ -36,6 +36,7 @@ def rows_of(root):
         }
 
 
+@pytest.mark.slow
 def test_poses_far_from_the_origin_are_stored_near_it_and_said_to_be(tmp_path, monkeypatch):
     """Odometry in UTM coordinates: the steps between poses keep their millimetres in float32."""
     plain = rows_of_import(tmp_path, "plain")
@@ -149,6 +150,7 @@ def test_rows_take_the_nearest_scan(tmp_path):
     assert (np.abs(numbers * 0.15 - t) <= 0.075 + 1e-9).all()
 
 
+@pytest.mark.slow
 def test_sequences_are_cut_by_length_and_by_pauses(tmp_path):
     path = record(tmp_path / "bag", "ros2", seconds=20.0, pause=(6.05, 9.95, "scan"), goals=())
     manifest = import_rosbag(path, tmp_path / "d", length=np.int64(20))
@@ -192,6 +194,7 @@ def test_every_episode_has_one_goal(tmp_path):
     assert np.isnan(c["robot_state"][ends[2] + 1 :, 0]).all()
 
 
+@pytest.mark.slow
 def test_176_rows_are_no_timeout(tmp_path):
     """The original's limit is not the recorded robot's: row 176 is cut off by a new goal, not by a clock."""
     path = record(tmp_path / "bag", "ros1", seconds=40.0, goals=((0.0, 90.0, 1.0), (35.1, 95.0, 1.0)))
@@ -201,6 +204,7 @@ def test_176_rows_are_no_timeout(tmp_path):
     assert (c["event"][c["is_last"]] == Event.CUT).all()
 
 
+@pytest.mark.slow
 def test_several_bags(tmp_path):
     paths = [record(tmp_path / "a", "ros1"), record(tmp_path / "b", "ros1", seconds=4.0)]
     manifest = import_rosbag(paths, tmp_path / "d", env="lab", rings=False)
@@ -329,6 +333,7 @@ def test_clocks_that_jump_cost_no_memory(tmp_path):
     assert import_rosbag(bag.path, tmp_path / "d").rows == 11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_bags_are_refused(tmp_path, kind):
     path = record(tmp_path / "bag", kind, seconds=1.0)

@@ -310,6 +310,7 @@ def test_shares_that_cannot_be_used(few, tmp_path, shares, words):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_too_few_sequences_to_split(few, tmp_path):
     split(few, tmp_path / "one", shares={"train": 0.6, "val": 0.2, "test": 0.2})
     with pytest.raises(ConfigError, match="1 sequences are too few for 3 splits"):
@@ -410,6 +411,7 @@ def changed(root, out, **fields):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fields", "words"),
     [

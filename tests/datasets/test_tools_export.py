@@ -96,6 +96,7 @@ def test_generated_rows_survive_export_and_import(generated, tmp_path):
         assert not new["leading_action"][old["is_first"]].any()
 
 
+@pytest.mark.slow
 def test_names_sort_like_sequences(tmp_path, monkeypatch):
     from navrep_data.datasets.tools import exports
 

@@ -82,6 +82,7 @@ def test_rows_in_two_splits(sound, tmp_path):
     assert "is in split test, the other in train" in found[0][2]
 
 
+@pytest.mark.slow
 def test_doubled_rows_in_one_split_are_a_note(sound, tmp_path):
     def change(k, columns, worlds):
         if k == 0:
@@ -149,6 +150,7 @@ def test_a_sensor_that_cannot_be(sound, tmp_path):
     assert any("expected a full turn at most" in what for check, _, what in problems(root) if check == "sensor")
 
 
+@pytest.mark.slow
 def test_a_goal_that_jumps(sound, tmp_path):
     def change(k, columns, worlds):
         if k == 1:
@@ -160,6 +162,7 @@ def test_a_goal_that_jumps(sound, tmp_path):
     assert "the goal jumps by 0.50 m" in found[0][2]
 
 
+@pytest.mark.slow
 def test_a_goal_beside_that_of_the_worlds_file(sound, tmp_path):
     def change(k, columns, worlds):
         worlds["robot_goal"][0, 1] += 0.3
@@ -169,6 +172,7 @@ def test_a_goal_beside_that_of_the_worlds_file(sound, tmp_path):
     assert "points 0.30 m beside the goal of its worlds file" in found[0][2]
 
 
+@pytest.mark.slow
 def test_a_goal_that_was_not_reached(sound, tmp_path):
     def change(k, columns, worlds):
         last = int(np.flatnonzero(columns["is_last"])[0])

@@ -91,6 +91,7 @@ def hands():
         one.window.close()
 
 
+@pytest.mark.slow
 def test_the_robot_goes_where_the_keys_say(hands):
     env = NavRepEnv("navrep-train", humans=0, obstacles=0)
     # show() waits once and the loop waits once: two ticks per step
@@ -135,6 +136,7 @@ def test_without_a_display_it_says_so():
         play(NavRepEnv("navrep-test"))
 
 
+@pytest.mark.slow
 def test_play_opens_and_closes_its_window(monkeypatch):
     monkeypatch.setattr(window, "has_display", lambda: True)
     monkeypatch.setattr("matplotlib.figure.Figure.show", lambda self: None)

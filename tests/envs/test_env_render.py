@@ -191,6 +191,7 @@ class Still:
         return np.zeros((self.batch, 3))
 
 
+@pytest.mark.slow
 def test_gif(tmp_path):
     env = make("navrep-test")
     film = record(env, goal_policy, tmp_path / "deep" / "episode.gif", options={"episode": 12}, size=120)
@@ -276,6 +277,7 @@ def display(monkeypatch):
     return shown
 
 
+@pytest.mark.slow
 def test_human_mode_follows_each_step(display):
     env = make("navrep-test", render_mode="human")
     env.reset(seed=1000)

@@ -72,6 +72,7 @@ def test_original_episodes_are_the_original_softwares():
         np.testing.assert_allclose(info["robot"], run["robot"], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env", "physics"), STREAMED)
 def test_a_seed_is_a_stream_elsewhere(env, physics):
     sim = Simulator(make_config(env, physics=physics), seed=41)

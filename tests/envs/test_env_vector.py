@@ -61,6 +61,7 @@ def test_equals_single_stepping_bit_for_bit(env, physics, n):
     assert ended >= n or (env.startswith("crowdmove") and physics == "original")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
 @pytest.mark.parametrize("env", ["navrep-train", "soadrl"])
 def test_infos_are_those_of_gymnasiums_own_vector_environment(env, mode):

@@ -114,6 +114,7 @@ def test_bootstrap_is_seeded_leaves_out_nan_and_covers_as_the_normal_does():
     assert all(math.isnan(x) for x in bootstrap([math.nan]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 3, 200, 1081])
 def test_bootstrap_is_one_resample_after_the_other(n):
     """In a plain loop; 1,081 values are drawn in several parts, of which the last is shorter."""

@@ -89,6 +89,7 @@ def test_metrics_and_events_are_those_of_a_plain_loop(physics):
         assert episode.trajectory[-1] == pytest.approx(100 * np.array(path[-1]), abs=0.51)
 
 
+@pytest.mark.slow
 def test_the_goal_rule_gives_the_originals_control():
     """15.0 % on the original's 200 seeded test episodes (original_scores.json, note)."""
     note = reference("original_scores.json")["note"]

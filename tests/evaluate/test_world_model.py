@@ -104,6 +104,7 @@ def test_table_and_figure(dataset, tmp_path):
         figure(results, tmp_path / "errors.jpg")
 
 
+@pytest.mark.slow
 def test_of_v_alone_the_reconstruction_is_measured_over_the_same_rows(dataset, tmp_path):
     model = make("transformer")
     whole = world_model_error(model, dataset, split="train", steps=2, name="W")

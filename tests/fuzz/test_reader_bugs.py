@@ -108,6 +108,7 @@ def test_statistics_that_are_no_table(files, name, key, value):
     refused(lambda: target.read(files), CorruptDataError, "statistics' holds something else than numbers")
 
 
+@pytest.mark.slow
 @of("manifest")
 @pytest.mark.parametrize("columns", [["a" * 100_000], ["scan"] * 10_000])
 def test_column_names_without_end(files, columns):
@@ -154,6 +155,7 @@ def test_a_training_that_names_no_checkpoint(files, text):
     refused(lambda: BY_NAME["training"].read(files), CheckpointError, "start anew in another folder")
 
 
+@pytest.mark.slow
 @of("training")
 @pytest.mark.parametrize("text", ["[]", "{}", '{"step": "x"}', '{"best": null, "step": {}, "tokens": 1}'])
 def test_a_training_that_stands_nowhere(files, text):

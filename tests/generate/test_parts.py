@@ -82,6 +82,7 @@ def test_merged_parts_are_the_dataset_of_one_run(root, whole):
     assert tree(root) == whole
 
 
+@pytest.mark.slow
 def test_a_merge_that_was_killed_while_cleaning_up(root, whole, tmp_path):
     shutil.copytree(root / "parts" / "0001-of-00003", tmp_path / "left")
     merge_manifest(root)
@@ -91,6 +92,7 @@ def test_a_merge_that_was_killed_while_cleaning_up(root, whole, tmp_path):
     assert tree(root) == whole
 
 
+@pytest.mark.slow
 def test_a_merged_dataset_can_be_extended(root, tmp_path):
     merge_manifest(root)
     generate(out=root, **{**SMALL, "n": 9})
@@ -98,6 +100,7 @@ def test_a_merged_dataset_can_be_extended(root, tmp_path):
     assert tree(root) == tree(tmp_path / "nine")
 
 
+@pytest.mark.slow
 def test_more_jobs_than_shards(tmp_path, whole):
     results = [generate(out=tmp_path / "d", shard_range=f"{k}/6", **SMALL) for k in range(6)]
     assert sorted(r.shards for r in results) == [0, 0, 1, 1, 1, 1]

@@ -38,6 +38,7 @@ def rewrite(root, harm):
     manifest.with_shards([entry, *manifest.shards[1:]], complete=True).save(root)
 
 
+@pytest.mark.slow
 def test_a_true_dataset_is_equal_to_the_byte(dataset):
     report = regenerate(dataset, 5)
     assert [c.sequence for c in report.comparisons] == [0, 1, 2, 3, 4]
@@ -52,6 +53,7 @@ def test_the_choice_can_be_repeated(dataset):
     assert any(c != chosen[0] for c in chosen[2:])
 
 
+@pytest.mark.slow
 def test_a_forged_reward_is_found(dataset, tmp_path):
     root = tmp_path / "d"
     shutil.copytree(dataset, root)
@@ -67,6 +69,7 @@ def test_a_forged_reward_is_found(dataset, tmp_path):
     assert second.largest == pytest.approx(0.5, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_millimetre_is_counted_and_passes(dataset, tmp_path):
     root = tmp_path / "d"
     shutil.copytree(dataset, root)
@@ -91,6 +94,7 @@ def test_odd_lengths_compare_columns(tmp_path):
     assert {c.verdict for c in regenerate(tmp_path / "d", 3).comparisons} <= {"equal bytes", "equal columns"}
 
 
+@pytest.mark.slow
 def test_python_policies_need_their_module(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "regen_policy.py").write_text(

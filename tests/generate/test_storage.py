@@ -38,6 +38,7 @@ def url():
     return f"memory://{uuid.uuid4().hex}/d"
 
 
+@pytest.mark.slow
 def test_the_place_holds_the_dataset_of_a_local_run(tmp_path, url, whole):
     result = generate(n=7, out=tmp_path / "d", storage=url, **SMALL)
     assert (result.sequences, result.new_rows) == (7, 210)
@@ -49,6 +50,7 @@ def test_the_place_holds_the_dataset_of_a_local_run(tmp_path, url, whole):
     assert verify(copy).ok
 
 
+@pytest.mark.slow
 def test_interrupted_and_extended(tmp_path, url, whole, monkeypatch):
     real, made = executors.make_shard, []
 
@@ -69,6 +71,7 @@ def test_interrupted_and_extended(tmp_path, url, whole, monkeypatch):
     assert remote(url) == whole
 
 
+@pytest.mark.slow
 def test_what_is_lost_there_is_made_again(tmp_path, url, whole):
     generate(n=7, out=tmp_path / "d", storage=url, **SMALL)
     fs, base = fsspec.core.url_to_fs(url)
@@ -89,6 +92,7 @@ def test_another_dataset_there_is_left_alone(tmp_path, url):
     assert not (tmp_path / "b").exists()
 
 
+@pytest.mark.slow
 def test_workers_whose_files_cannot_be_seen_from_here(tmp_path, url, monkeypatch):
     """memory:// is a place of each process's own: a run must not end well with its shards gone."""
     monkeypatch.setattr(storage, "VISIBLE_SECONDS", 0.1)

@@ -30,6 +30,7 @@ def simulated(tmp_path_factory):
     return tiny_dataset(tmp_path_factory.mktemp("cards") / "tiny", n=4, length=60)
 
 
+@pytest.mark.slow
 def test_cards_are_current():
     committed = {path.stem: path.read_text() for path in FOLDER.glob("*.md")}
     assert set(committed) == set(ENVS) == {path.stem for path in FOLDER.glob("*.json")}, AGAIN

@@ -220,6 +220,7 @@ def test_the_cache_stays_within_its_bound(hub, pushed, template, tmp_path, monke
     assert hub.count(SHARD, "GET") > 3  # something went and came again
 
 
+@pytest.mark.slow
 def test_a_cache_that_is_too_small_is_refused(hub, pushed, template):
     largest = max(shard_bytes(template))
     with pytest.raises(ConfigError, match=f"expected at least the largest shard of user/crowd@.*, {largest:,} bytes"):

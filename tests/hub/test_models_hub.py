@@ -203,6 +203,7 @@ def test_another_model_leaves_nothing_of_the_first(hub, tmp_path):
     same_weights(zoo.load(f"hf://{REPO}"), world_model())
 
 
+@pytest.mark.slow
 def test_offline_and_cached(hub, tmp_path, monkeypatch):
     checkpoint.save(world_model(), tmp_path / "m")
     commit = push_model(tmp_path / "m", REPO, license="mit").commit
@@ -288,6 +289,7 @@ def test_what_is_not_there(hub):
         zoo.load("hf://none")
 
 
+@pytest.mark.slow
 def test_all_files_of_a_policy_are_listed_in_its_card(hub, tmp_path):
     zoo.save_policy(a_policy(), Path(tmp_path / "p"))
     push_model(tmp_path / "p", REPO, license="mit")

@@ -516,6 +516,7 @@ def test_a_manifest_that_asks_for_too_much(hub, pushed, tmp_path, change, words)
     assert sorted(p.name for p in tmp_path.iterdir()) in ([], ["hf-cache"])
 
 
+@pytest.mark.slow
 def test_a_manifest_that_is_too_large(hub, pushed, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_MAX_MANIFEST_BYTES", 100)
     with pytest.raises(DatasetError, match=r"has a manifest.json of [\d,]+ bytes, expected at most"):
@@ -648,6 +649,7 @@ def test_somebody_elses_namespace(hub, template):
 # ---- offline ----
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("switch", few(["NAVREP_DATA_OFFLINE", "HF_HUB_OFFLINE"], 1))
 def test_offline_asks_nobody(hub, pushed, template, tmp_path, monkeypatch, switch):
     monkeypatch.setenv(switch, "1")

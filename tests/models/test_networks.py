@@ -34,6 +34,7 @@ def test_parameter_counts_are_the_originals(kind, config, count):
     assert n_parameters(checkpoint.make(kind, config)) == count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["modular", "joint", "transformer"])
 @pytest.mark.parametrize("lidar", ["rings", "1d"])
 def test_world_models_take_and_give_the_same_shapes(kind, lidar):

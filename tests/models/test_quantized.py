@@ -23,6 +23,7 @@ def small_vae(lidar):
     return VAE(VAEConfig(lidar, 16)).eval()
 
 
+@pytest.mark.slow
 @needs_int8
 @pytest.mark.parametrize("lidar", ["rings", "1d"])
 def test_codes_are_near_those_of_float32(lidar, scans):
@@ -73,6 +74,7 @@ def test_the_same_calibration_gives_the_same_encoder_in_any_batch(scans):
     np.testing.assert_allclose(torch.cat([first(part) for part in obs.split(7)]), whole, atol=1e-6)
 
 
+@pytest.mark.slow
 @needs_int8
 def test_the_v_itself_stays_as_it_is(scans):
     vae = small_vae("rings")

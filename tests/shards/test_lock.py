@@ -66,6 +66,7 @@ def shared_folder():
         yield folder
 
 
+@pytest.mark.slow
 @needs_root
 @pytest.mark.parametrize("mode", [0o2775, 0o775])
 def test_a_group_goes_on_with_each_others_datasets(shared_folder, mode):

@@ -306,6 +306,7 @@ def six(tmp_path):
     return tmp_path / "six"
 
 
+@pytest.mark.slow
 def test_a_part_of_a_dataset_is_a_dataset_that_says_so(six):
     whole = Manifest.read(six)
     assert select_shards(whole, range(len(whole.shards))) is whole
@@ -341,6 +342,7 @@ def test_choose_shards(six, asked, chosen):
     assert choose_shards(Manifest.read(six), **asked) == chosen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("asked", "words"),
     [

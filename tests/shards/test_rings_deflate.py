@@ -56,6 +56,7 @@ def test_repeated_sections(repeats):
     check(sections.reshape(repeats, 64, 64))
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.floats(0.0, 1.0))
 def test_random_rings(seed, rows, noise):

@@ -34,6 +34,7 @@ def oracle(name, values, is_last):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scan_dtype", ["uint16", "float32"])
 def test_against_the_oracle(scan_dtype):
     sequences = [make_sequence(k, 150, scan_dtype=scan_dtype) for k in range(3)]

@@ -25,6 +25,7 @@ def test_an_intact_dataset_has_no_problems(dataset):
     assert report.to_dict()["ok"] is True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{"scan_dtype": "float32"}, {"worlds": False}])
 def test_intact_variants(tmp_path, changes):
     make_dataset(tmp_path, 4, 2, 50, **changes)

@@ -91,6 +91,7 @@ def test_bytes_are_a_function_of_the_input(tmp_path):
     assert c.sequence_hashes == a.sequence_hashes
 
 
+@pytest.mark.slow
 def test_sequence_hash_ignores_rings_chunks_and_nan_payloads():
     columns, worlds = make_sequence(0)
     plain = make_writer()
@@ -132,6 +133,7 @@ def test_chunk_rows_divide_the_length():
     assert [chunk_rows(n) for n in (1000, 997, 7, 1, 36, 48)] == [25, 25, 25, 25, 18, 24]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [True, False])
 @pytest.mark.parametrize("dtype", ["u1", "<u2", "<i4", "<f4", "<f8"])
 @pytest.mark.parametrize("items", [1, 50, 5000, 20_000])

@@ -132,6 +132,7 @@ def unreached(model):
     return [n for n, p in model.named_parameters() if p.grad is None or not bool(p.grad.abs().sum() > 0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("original", [False, True])
 @pytest.mark.parametrize("kind", ["joint", "transformer"])
 def test_gradients_reach_every_weight_of_a_world_model(kind, original):

@@ -17,6 +17,7 @@ def gradients(vae, loss):
     return {name: p.grad.clone() for name, p in vae.named_parameters()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lidar", "shape"), [("rings", (64, 64)), ("1d", (1080,))])
 def test_values_and_gradients_are_those_of_the_plain_network(lidar, shape):
     torch.manual_seed(0)

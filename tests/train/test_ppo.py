@@ -95,6 +95,7 @@ def test_a_rollout_does_not_depend_on_the_groups(parts):
     assert np.std(one.actions - one.actions.mean(), axis=1).min() > 0.1  # every world draws its own noise
 
 
+@pytest.mark.slow
 def test_an_update_is_that_of_stable_baselines3(parts):
     ours = started(parts, 2)
     buffer = collect(ours)

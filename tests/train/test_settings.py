@@ -40,6 +40,7 @@ def test_the_list_has_each_setting_of_a_stage_with_its_default(stage):
     assert all(len(line.splitlines()) == 1 for line in lines)
 
 
+@pytest.mark.slow
 def test_the_command_lists_and_ends(capsys):
     with pytest.raises(SystemExit) as stop:
         run(["train", "controller", "--list-settings"])

@@ -328,6 +328,7 @@ def test_what_does_not_belong_together_is_not_shipped(trained, package, dataset,
     }
 
 
+@pytest.mark.slow
 def test_rounding_sees_what_changed(trained, dataset):
     model = checkpoint.load(trained / "w")
     assert rounding(model, model, dataset).z_change == 0

@@ -374,6 +374,7 @@ def test_shipped_commands_give_the_shipped_settings(tmp_path, monkeypatch):
 # --- codes ---
 
 
+@pytest.mark.slow
 def test_codes_are_those_of_the_rows(dataset, latents):
     vae, codes = latents
     windows = SequenceDataset(dataset, "1d", window=20, split="train", scan_unit="normalized", invalid="range_max")

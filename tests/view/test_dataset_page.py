@@ -26,6 +26,7 @@ def rows_of(folder, sequence):
     return index, int(rows[0]), int(rows[-1]) + 1
 
 
+@pytest.mark.slow
 def test_the_page_holds_the_dataset_to_the_quantisation(dataset):
     page = Reader(dataset_page(dataset, [2]).html)
     (entry,) = page.meta["sequences"]
@@ -110,6 +111,7 @@ def test_the_size_is_bounded_and_the_page_says_what_was_left_out(dataset, max_by
         assert sum(e["length"] for e in entry["episodes"]) == entry["rows"]
 
 
+@pytest.mark.slow
 def test_a_page_of_three_sequences_by_default_and_all_that_were_asked_for(dataset):
     page = dataset_page(dataset)
     assert [e["sequence"] for e in Reader(page.html).meta["sequences"]] == [0, 1, 2]
@@ -117,6 +119,7 @@ def test_a_page_of_three_sequences_by_default_and_all_that_were_asked_for(datase
     assert [e["sequence"] for e in Reader(dataset_page(dataset, [3, 1, 3]).html).meta["sequences"]] == [3, 1]
 
 
+@pytest.mark.slow
 def test_equal_data_give_equal_pages(dataset):
     assert dataset_page(dataset).html == dataset_page(dataset).html
 
@@ -153,6 +156,7 @@ def hostile(dataset, tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 def test_hostile_names_are_text(hostile, dataset):
     page, harmless = Reader(dataset_page(hostile).html), Reader(dataset_page(dataset).html)
     assert page.tags == harmless.tags
@@ -188,6 +192,7 @@ def test_the_policy_allows_this_script_and_style_and_nothing_else(page_file):
     assert not any(name.startswith("on") or name == "style" for _, name, _ in page.attributes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["page_file", "results_file"])
 def test_nothing_in_the_page_points_elsewhere(kind, request):
     html = request.getfixturevalue(kind).read_text()

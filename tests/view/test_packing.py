@@ -11,6 +11,7 @@ from navrep_data.view.packing import NAN_CODE, pack_rings, quantise, zigzag_delt
 FLOATS = st.floats(width=32, allow_nan=True, allow_infinity=True)
 
 
+@pytest.mark.slow
 @given(arrays(np.float64, array_shapes(max_dims=2, max_side=20), elements=FLOATS))
 def test_codes_are_within_half_a_step_and_nan_stays_nan(values):
     codes, origin, step = quantise(values, 0.001)
@@ -33,6 +34,7 @@ def test_huge_numbers_are_unknown(values):
     assert (codes == NAN_CODE).all()
 
 
+@pytest.mark.slow
 @given(arrays(np.uint16, array_shapes(min_dims=2, max_dims=2, max_side=30)))
 def test_differences_fold_and_unfold(codes):
     for row, folded in zip(codes.tolist(), zigzag_delta(codes).tolist(), strict=True):

@@ -79,6 +79,7 @@ def test_metrics_have_their_units(results):
     assert Reader(results_page(results / "0.json").html).meta["units"] == units
 
 
+@pytest.mark.slow
 def test_the_size_is_bounded(tmp_path):
     for k in range(4):
         write_results(tmp_path / "r", f"p{k}", n=500, seed=k)

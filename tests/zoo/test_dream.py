@@ -56,6 +56,7 @@ def test_dreams_are_seeded_and_keep_to_their_spaces(kind, dataset):
         assert all(np.array_equal(a[name], b[name]) for name in a)
 
 
+@pytest.mark.slow
 def test_the_first_frame_is_the_datasets_and_reward_is_metres_towards_the_goal(dataset):
     model = make("transformer")
     env = DreamEnv(model, dataset, real_rows=4)
@@ -88,6 +89,7 @@ def led_to(env):
     return torch.cat([torch.zeros(1, 1, 3), env._taken[:, :-1]], dim=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "delay"), [("transformer", 0), ("joint", 1)])
 def test_an_action_acts_at_once_where_the_model_is_fed_the_one_taken(kind, delay, dataset):
     def second_row(first):

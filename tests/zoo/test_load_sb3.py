@@ -88,6 +88,7 @@ def test_any_navrep_environment_can_be_set(tmp_path):
         assert moved(before, model)
 
 
+@pytest.mark.slow
 def test_observations_are_the_features_of_what_was_driven():
     """Replayed by the policy itself: memory fed the velocities that were executed, cleared where episodes start."""
     policy, other = with_memory(), with_memory()

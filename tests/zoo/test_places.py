@@ -24,6 +24,7 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("load", [zoo.load, load_any_model])
 def test_the_zoo_wins_where_a_folder_has_its_name(here, load):
     assert load("e2e_1d.v1").name == "e2e_1d.v1"
@@ -32,6 +33,7 @@ def test_the_zoo_wins_where_a_folder_has_its_name(here, load):
     assert isinstance(load(here / "e2e_1d.v1"), VAE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("find", [zoo.load, load_any_model, resolve_policy, full_name])
 def test_a_folder_named_by_a_bare_word_is_refused_with_what_to_write(here, find):
     with pytest.raises(UnknownNameError, match=r"There is a \./mine here: to name that, write \./mine"):

@@ -156,6 +156,7 @@ def test_records_say_what_robot_a_policy_was_trained_on(name):
     assert RobotContract(**zoo.show(name).robot) == RobotContract()
 
 
+@pytest.mark.slow
 def test_what_generate_says_of_networks_is_so(tmp_path, monkeypatch):
     """The file that the refusal tells one to write drives the robot of the environment at its speed."""
     monkeypatch.chdir(tmp_path)

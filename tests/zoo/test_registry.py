@@ -193,6 +193,7 @@ def test_untagged_name_of_a_variant_about_to_ship_never_means_the_authors(capsys
         zoo.load("transformer_rings_z")
 
 
+@pytest.mark.slow
 def test_listing_needs_no_torch_and_no_network():
     code = (
         "import sys, navrep_data.zoo as z; z.list_models(); z.show('e2e_1d.20201026'); "

@@ -65,6 +65,7 @@ def test_the_default_is_put_back(other_settings):
     assert (torch.get_default_dtype(), torch.get_default_device()) == before
 
 
+@pytest.mark.slow
 def test_datasets_are_the_same_whatever_torchs_defaults_are(tmp_path, other_settings):
     tiny_dataset(tmp_path / "tiny")
     window = SequenceDataset(tmp_path / "tiny", lidar="rings", window=8)[0]
