@@ -20,8 +20,6 @@ HOW = {"ranges": RANGES[0], "scaling": SCALING[0], "inference": INFERENCE[0]}
 """Settings of a run that decide what a network is fed, with the default of each."""
 BY_CONTRACT = "contract, scaled"
 """How networks are fed by default, in words."""
-_FROM_THE_FIRST = "from 0"
-_BEFORE_FEEDING = "uncut, as trained, by an earlier version"
 
 
 def is_benchmark(entry: Entry) -> bool:
@@ -30,8 +28,8 @@ def is_benchmark(entry: Entry) -> bool:
 
 
 def first_round(entry: Entry) -> int:
-    """Return the first round that was played; 0 where an entry does not say it."""
-    return int(str(entry.get("rounds", "0")).split()[0])
+    """Return the first round that was played."""
+    return int(str(entry["rounds"]).split()[0])
 
 
 def key(entry: Entry) -> tuple[Any, ...]:
@@ -66,24 +64,22 @@ def other_result(results: Sequence[Entry], suite: str, physics: str) -> Entry | 
 
 def feeding(entry: Entry) -> str:
     """Return in words how a network was fed."""
-    fed = (fed_as(entry) or BY_CONTRACT) if "ranges" in entry else _BEFORE_FEEDING
-    return ", ".join(word for word in (fed, noise_of(entry)) if word)
+    return ", ".join(word for word in (fed_as(entry) or BY_CONTRACT, noise_of(entry)) if word)
 
 
 def episodes(entry: Entry) -> str:
     """Return how many episodes were played, and in which rounds."""
-    return f"{entry['episodes']} ({entry.get('rounds', _FROM_THE_FIRST)})"
+    return f"{entry['episodes']} ({entry['rounds']})"
 
 
 def played(entry: Entry) -> str:
     """Return in words what was played, and fed how: no two results of a record have the same."""
-    rounds = entry.get("rounds", _FROM_THE_FIRST)
-    how = f"{entry['physics']} physics, {entry['episodes']} episodes, rounds {rounds}"
+    how = f"{entry['physics']} physics, {entry['episodes']} episodes, rounds {entry['rounds']}"
     return f"{entry['suite']}, {how}, feeding: {feeding(entry)}"
 
 
 def share(entry: Entry, name: str, interval: bool = False) -> str:
-    """Return a share of a result in percent, "-" where it was not measured: contacts were not always recorded."""
+    """Return a share of a result in percent, "-" where it was not measured."""
     if entry.get(name) is None:
         return "-"
     text = f"{entry[name]:.1%}"

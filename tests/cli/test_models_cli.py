@@ -9,6 +9,7 @@ import warm_process
 from recorded import golden as recorded_golden
 from recorded import write_golden
 
+from navrep_data.cli import models
 from navrep_data.testing import tiny_checkpoint
 
 pytestmark = pytest.mark.slow  # seconds each; `make test` runs them
@@ -62,9 +63,13 @@ def test_several_patterns_are_one_list(run):
 
 
 def test_where_only_another_feeding_was_measured_that_is_shown_and_marked(run):
-    done = run("transformer_1d_z.20201015")
-    assert "  23.5 (23.5) %*  " in done.stdout
-    assert "'*' = fed in another way than by default" in done.stderr
+    cut = {"suite": "navreptest", "physics": "original", "rounds": "0 to 199", "ranges": "contract", "scaling": "robot",
+           "success_rate": 0.5, "contact_free_rate": 0.25}  # fmt: skip
+    uncut = {**cut, "ranges": "as_released", "scaling": "none", "success_rate": 0.235, "contact_free_rate": 0.2}
+    assert models._score([uncut], "navreptest") == "20.0 (23.5) %*"
+    assert models._score([uncut, cut], "navreptest") == "25.0 (50.0) %"
+    assert models._score([uncut], "navrep27") == "-"
+    assert "'*' = fed in another way than by default" in run("transformer_1d_z.20201015").stderr
 
 
 def test_show_takes_a_folder(run, tmp_path):

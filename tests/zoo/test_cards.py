@@ -62,14 +62,15 @@ def test_results_are_shown_with_command_and_baseline(monkeypatch):
     assert "Not measured yet." in cards.card("modular_1d_z")
     runs = registry.variants()["e2e_1d"]
     result = {
-        "suite": "navreptest", "physics": "original", "episodes": 200, "success_rate": 0.625,
-        "goal_success_rate": 0.15, "command": "navrep-data benchmark zoo:e2e_1d.20201026 --suite navreptest",
+        "suite": "navreptest", "physics": "original", "episodes": 200, "rounds": "0 to 199",
+        "ranges": "as_released", "scaling": "none", "success_rate": 0.625, "goal_success_rate": 0.15,
+        "command": "navrep-data benchmark zoo:e2e_1d.20201026 --suite navreptest",
     }  # fmt: skip
     measured = tuple(dataclasses.replace(r, results=(result,)) if r.tag == "20201026" else r for r in runs)
     monkeypatch.setattr(cards, "variants", lambda: {"e2e_1d": measured})
     text = cards.card("e2e_1d")
     assert (
-        "| `e2e_1d.20201026` | navreptest | original | 200 (from 0) | uncut, as trained, by an earlier version | - | "
+        "| `e2e_1d.20201026` | navreptest | original | 200 (0 to 199) | ranges as the authors fed them | - | "
         "62.5% | - / 15.0% | `navrep-data benchmark zoo:e2e_1d.20201026 --suite navreptest` |"
     ) in text
     one = next(r for r in measured if r.tag == "20201026")
