@@ -63,8 +63,10 @@ def test_several_patterns_are_one_list(run):
 
 
 def test_where_only_another_feeding_was_measured_that_is_shown_and_marked(run):
-    cut = {"suite": "navreptest", "physics": "original", "episodes": 200, "rounds": "0 to 199", "ranges": "contract", "scaling": "robot",
-           "success_rate": 0.5, "contact_free_rate": 0.25}  # fmt: skip
+    cut = {
+        "suite": "navreptest", "physics": "original", "episodes": 200, "rounds": "0 to 199", "ranges": "contract",
+        "scaling": "robot", "success_rate": 0.5, "contact_free_rate": 0.25,
+    }  # fmt: skip
     uncut = {**cut, "ranges": "as_released", "scaling": "none", "success_rate": 0.235, "contact_free_rate": 0.2}
     assert models._score([uncut], "navreptest") == "20.0 (23.5) %*"
     assert models._score([uncut, cut], "navreptest") == "25.0 (50.0) %"
