@@ -57,7 +57,14 @@ def test_every_way_of_playing_reaches_the_record_with_its_whole_command(entries)
 
 
 def test_a_record_keeps_them_apart_and_a_new_measurement_replaces_its_own_alone(entries):
-    old = {"suite": "navreptest", "physics": "original", "episodes": 200, "success_rate": 0.5, "command": "old"}
+    old = {
+        "suite": "navreptest",
+        "physics": "original",
+        "episodes": 200,
+        "rounds": "0 to 199",
+        "success_rate": 0.5,
+        "command": "old",
+    }
     consistent = {**entries[0], "physics": "consistent"}
     error = {"suite": "world-model", "split": "test", "scan_mse": 0.1, "command": "errors"}
     kept = measured.merged([old, consistent, error], entries)
@@ -73,7 +80,7 @@ def test_lists_show_the_main_result_alone(entries):
     later, main = ({**e} for e in sorted(entries, key=lambda e: "--first-round" not in e["command"])[:2])
     assert measured.main_result([later], "navreptest", "original") is None
     assert measured.main_result([*entries[1:], main], "navreptest", "original")["command"] == COMMAND
-    old = {"suite": "navreptest", "physics": "original", "success_rate": 0.5}
+    old = {"suite": "navreptest", "physics": "original", "rounds": "0 to 199", "success_rate": 0.5}
     assert measured.main_result([later, old], "navreptest", "original") == old
     assert _score([later, {**main, "contact_free_rate": 0.25, "success_rate": 0.5}], "navreptest") == "25.0 (50.0) %"
     assert _score([later], "navreptest") == "-"
