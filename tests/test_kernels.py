@@ -94,6 +94,8 @@ def run_probe(tmp_path):
             "NAVREP_DATA_HOME": str(tmp_path / "home"),
             "NUMBA_DISABLE_JIT": "0",
             "NUMBA_BOUNDSCHECK": str(int(checked)),
+            # bytecode is told from stale by second and size: an edit of the same length within a second is not seen
+            "PYTHONDONTWRITEBYTECODE": "1",
         }
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
