@@ -237,6 +237,33 @@ def generate_core(effort: Effort) -> list[Row]:
     return [rate_row("generate-core", a, b, "np.savez_compressed, writing alone", note, "slower")]
 
 
+def labels(effort: Effort) -> list[Row]:
+    """Measure what it costs to store what each ray hit: rows per second beside those without, and bytes."""
+    import h5py
+
+    from navrep_data.generate import generate
+
+    with tempfile.TemporaryDirectory() as folder:
+        numbers = itertools.count()
+
+        def make(on: bool) -> Callable[[], float]:
+            return lambda: float(generate("soadrl", effort.core, Path(folder) / str(next(numbers)), labels=on).new_rows)
+
+        a, b = in_turns([make(True), make(False)], effort.repeats, effort.seconds)
+        shards = list((Path(folder) / "0" / "data").glob("*.h5"))
+        sizes = []
+        for path in shards:
+            with h5py.File(path) as file:
+                sizes.append((file["scan_label"].id.get_storage_size(), len(file["scan_label"])))
+        stored, rows = map(sum, zip(*sizes, strict=True))
+    note = f"n={effort.core}, all columns"
+    each = [size / count for size, count in sizes]
+    return [
+        rate_row("label-speed", a, b, "without labels", note),
+        plain_row("label-bytes", each, "one byte per ray", [1080.0], f"{stored / rows:.1f} over {rows:,} rows"),
+    ]
+
+
 def dataset(effort: Effort) -> list[Row]:
     """Measure bytes per row and random windows of one generated dataset."""
     from navrep_data.generate import generate
@@ -321,6 +348,7 @@ CASES: dict[str, Callable[[Effort], list[Row]]] = {
     "generate-core": generate_core,
     "lidar": lidar,
     "rings": rings,
+    "labels": labels,
     "dataset": dataset,
 }
 

@@ -121,18 +121,19 @@ def manifest_of_a_billion(size: int, shards: int) -> dict[str, Any]:
         root = Path(folder) / "d"
         make(n=size, length=20, shard_size=size, out=root)
         small = Manifest.read(root)
-        (entry,) = small.shards
+        entry = small.shards[0]
         assert entry.worlds is not None
         worlds = entry.worlds
         entries = [
             replace(
-                entry, file=shard_file(k), sequences=(k * size, (k + 1) * size),
-                worlds=FileEntry(worlds_file(k), worlds.sha256, worlds.bytes),
+                entry, file=shard_file("train", k), sequences=((k * size, k * size + entry.count),),
+                worlds=FileEntry(worlds_file("train", k), worlds.sha256, worlds.bytes),
             )
             for k in range(shards)
         ]  # fmt: skip
         begun = time.perf_counter()
-        replace(small, planned=size * shards).with_shards(entries, complete=True).save(root)
+        many = replace(small, planned=size * shards, split_rule="all are train")
+        many.with_shards(entries, complete=False).save(root)
         saved = time.perf_counter() - begun
         n_bytes = (root / "manifest.json").stat().st_size
         begun = time.perf_counter()

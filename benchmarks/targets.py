@@ -50,6 +50,8 @@ TARGETS: dict[str, Target] = {
     "windows-memory-1d": Target(f"{_WINDOWS} preloaded, scans", "windows/s", 30e3, 60e3),
     "windows-memory-rings": Target(f"{_WINDOWS} preloaded, rings", "windows/s", 30e3, 60e3),
     "scan-bytes": Target("scan bytes per row", "B", 1350, 1250, more=False),
+    "label-speed": Target("`generate --labels`, per core", "rows/s"),
+    "label-bytes": Target("bytes per row of `scan_label`", "B", 70, more=False),
     "row-bytes": Target("bytes per row, all columns", "B", 2200, 1800, more=False),
     "generate-memory": Target("peak memory of `generate`, all processes", "GB", 1.5, 0.8, more=False),
     "first-row": Target("first row on disk in a fresh process, kernels cached", "s", 2.0, more=False),

@@ -25,7 +25,7 @@ from torch.utils.data import BatchSampler, DataLoader
 from navrep_data.datasets import SequenceDataset, StreamingSequenceDataset
 from navrep_data.observations import millimetres_from_metres, scan_to_rings
 from navrep_data.schema import COLUMNS, Event, SensorContract
-from navrep_data.shards import Manifest, ShardWriter, publish
+from navrep_data.shards import DatasetWriter, Manifest, split_of
 
 W = 32
 ORIGINAL = Path(__file__).resolve().parents[1] / "../shared/reference/original_npz"
@@ -54,38 +54,36 @@ def make_dataset(root: Path, sequences: int) -> None:
     rng = np.random.default_rng(0)
     scans = [millimetres_from_metres(s) for s in source_scans()]
     rings = [scan_to_rings(s) for s in scans]
-    (root / "data").mkdir(parents=True)
+    root.mkdir(parents=True)
     settings: dict[str, Any] = {
         "env": "benchmark", "config": {}, "seed": 0, "sensor": SensorContract(), "scan_dtype": "uint16",
         "columns": COLUMN_NAMES, "max_humans": 0, "length": LENGTH,
     }  # fmt: skip
-    shards = []
-    for first in range(0, sequences, 10):
-        writer = ShardWriter(**settings, first_sequence=first)
-        for k in range(first, min(first + 10, sequences)):
-            step = np.arange(LENGTH) % 100
-            last = step == 99
-            values = {
-                "scan": scans[k % len(scans)],
-                "rings": rings[k % len(scans)],
-                "robot_state": rng.normal(size=(LENGTH, 5)),
-                "action": rng.normal(size=(LENGTH, 3)),
-                "reward": rng.normal(size=LENGTH),
-                "is_first": step == 0,
-                "is_last": last,
-                "is_terminal": np.zeros(LENGTH, bool),
-                "event": np.where(last, Event.TIMEOUT, 0),
-                "sequence": np.full(LENGTH, k),
-                "episode": np.arange(LENGTH) // 100,
-                "step": step,
-                "robot_pose": rng.normal(size=(LENGTH, 3)),
-                "robot_radius": np.full(LENGTH, 0.3),
-            }
-            dtypes = {name: "uint16" if name == "scan" else COLUMNS[name].dtype for name in values}
-            writer.append({name: np.ascontiguousarray(v, dtypes[name]) for name, v in values.items()})
-        shards.append(publish(root, len(shards), writer.finish()))
     manifest = Manifest(**settings, physics="none", planned=sequences, shard_size=10, policy={}, versions={})
-    manifest.with_shards(shards, complete=True).save(root)
+    writer = DatasetWriter(root, manifest)
+    for k in range(sequences):
+        step = np.arange(LENGTH) % 100
+        last = step == 99
+        values = {
+            "scan": scans[k % len(scans)],
+            "rings": rings[k % len(scans)],
+            "robot_state": rng.normal(size=(LENGTH, 5)),
+            "action": rng.normal(size=(LENGTH, 3)),
+            "reward": rng.normal(size=LENGTH),
+            "is_first": step == 0,
+            "is_last": last,
+            "is_terminal": np.zeros(LENGTH, bool),
+            "event": np.where(last, Event.TIMEOUT, 0),
+            "sequence": np.full(LENGTH, k),
+            "episode": np.arange(LENGTH) // 100,
+            "step": step,
+            "robot_pose": rng.normal(size=(LENGTH, 3)),
+            "robot_radius": np.full(LENGTH, 0.3),
+        }
+        dtypes = {name: "uint16" if name == "scan" else COLUMNS[name].dtype for name in values}
+        columns = {name: np.ascontiguousarray(v, dtypes[name]) for name, v in values.items()}
+        writer.append(k, split_of(k), columns)
+    writer.finish()
 
 
 class MemmapWindows:

@@ -19,7 +19,9 @@ from typing import Any
 from navrep_data.errors import ConfigError, SchemaVersionError
 
 FORMAT_NAME = "navrep-data"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+OLDEST_FORMAT = 2
+"""Format 1 was never released; from 2 on, every released format stays readable."""
 
 N_RAYS = 1080
 # The original's ray table: linspace(0, 6.27543783188, 1080) (pepper_2d_simulator.py); a hair short of a full turn.
@@ -172,11 +174,21 @@ class Column:
 HUMANS_AXIS = -1
 RAYS_AXIS = -2
 
+SIMULATED_COLUMNS = ("scan_label", "contact", "humans")
+"""Columns that only a simulator can fill: no recording has them."""
+LABEL_NOTHING, LABEL_STATIC, LABEL_ROBOT, LABEL_HUMAN = 0, 1, 2, 3
+"""Values of the column scan_label; the human in slot k of the column humans is ``LABEL_HUMAN + k``."""
+MAX_LABELLED = 256 - LABEL_HUMAN
+"""Slots of humans that labels of 8 bits can tell apart."""
+CONTACT_NONE, CONTACT_HUMAN, CONTACT_ROBOT, CONTACT_STATIC = 0, 1, 2, 3
+"""Values of the column contact."""
+
 COLUMNS: dict[str, Column] = {
     c.name: c
     for c in (
         Column("scan", (RAYS_AXIS,), "scan", "mm or m", "lidar ranges, ray 0 straight ahead, anticlockwise; 0 = invalid", wide=True),
         Column("rings", RINGS_SHAPE, "uint8", "", "polar occupancy, angle x radius: 0 free, 1 unknown, 2 occupied", wide=True, optional=True),
+        Column("scan_label", (RAYS_AXIS,), "uint8", "", "what each ray hit, before noise: 0 nothing, 1 static, 2 another robot, 3 + k the human in slot k of humans", wide=True, optional=True),
         Column("robot_state", (ROBOT_STATE_SIZE,), "float32", "m, m, m/s, m/s, rad/s", "goal x, goal y, vx, vy, omega in the robot frame", may_be_nan=True),
         Column("action", (ACTION_SIZE,), "float32", "m/s, m/s, rad/s", "body velocity command taken from this row's observation"),
         Column("reward", (), "float32", "", "result of this row's action"),
@@ -184,6 +196,7 @@ COLUMNS: dict[str, Column] = {
         Column("is_last", (), "bool", "", "last row of an episode; its action and reward mean nothing"),
         Column("is_terminal", (), "bool", "", "last row of an episode that ended in goal or collision"),
         Column("event", (), "uint8", "", "why the episode ended, 0 except on its last row"),
+        Column("contact", (), "uint8", "", "what the robot touched during this row's action, where collisions do damage: 0 nothing, 1 human, 2 robot, 3 static", optional=True),
         Column("sequence", (), "int32", "", "sequence index in the dataset"),
         Column("episode", (), "int32", "", "episode index within the sequence"),
         Column("step", (), "int32", "", "row index within the episode"),

@@ -24,7 +24,7 @@ def tiny_dataset(
     path : path-like
         Dataset folder, new or empty (or holding the same dataset already).
     n : int
-        Sequences; two per shard. With three or more, all splits have one.
+        Sequences; two per shard at most. With three or more, all splits have one.
     length : int
         Rows per sequence.
     seed : int

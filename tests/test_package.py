@@ -49,7 +49,7 @@ def test_public_functions_are_documented():
 def test_tiny_dataset_is_real(tmp_path):
     root = tiny_dataset(tmp_path / "tiny")
     manifest = Manifest.read(root)
-    assert (manifest.sequences, manifest.rows, len(manifest.shards)) == (4, 240, 2)
+    assert (manifest.sequences, manifest.rows, len(manifest.shards)) == (4, 240, 3)
     assert set(manifest.splits) == {"train", "val", "test"}
     assert verify(root).ok
     assert tiny_dataset(tmp_path / "tiny") == root

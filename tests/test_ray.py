@@ -217,7 +217,7 @@ def test_a_dataset_survives_a_killed_worker_and_a_killed_node(nodes, turnstile, 
     nodes.fill()
     generate(out=tmp_path / "here", **DATA)
     root = tmp_path / "there"
-    killer = Killer(nodes, turnstile, DATA["length"], lambda: len(list(root.glob("data/shard-*.h5"))))
+    killer = Killer(nodes, turnstile, DATA["length"], lambda: len(list(root.glob("data/*.h5"))))
     killer.start()
     result = generate(out=root, executor="ray", address=nodes.address, **DATA)
     killer.join()

@@ -85,6 +85,9 @@ def generate_command(
     humans_column: Annotated[
         bool, typer.Option("--humans-column/--no-humans-column", help="Store the humans behind each scan.")
     ] = True,
+    labels: Annotated[
+        bool, typer.Option("--labels/--no-labels", help="Store what each ray hit: the column scan_label.")
+    ] = False,
     executor: Annotated[
         str, typer.Option("--executor", help="local (this machine) or ray (a cluster; needs navrep-data\\[ray]).")
     ] = "local",
@@ -118,7 +121,8 @@ def generate_command(
         env=env, n=n, out=out, seed=seed, workers=workers, length=length,
         physics=physics, humans=humans, obstacles=obstacles, legs=legs, maps=maps or None, policy=policy,
         policy_batch=policy_batch, shard_size=shard_size, scan_dtype=scan_dtype, rings=rings,
-        humans_column=humans_column, executor=executor, address=address, storage=storage, shard_range=shard_range,
+        humans_column=humans_column, labels=labels, executor=executor, address=address, storage=storage,
+        shard_range=shard_range,
         progress=show_progress(), report=say_err if as_json else say,
     )  # fmt: skip
     if as_json:

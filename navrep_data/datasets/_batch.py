@@ -24,12 +24,12 @@ STEP_FIELDS = ("robot_state", "action", "action_valid", "reward", "is_first", "i
 """Fields of a default window besides the lidar and ``mask``."""
 STORED_FIELDS = (
     *("reward", "is_first", "is_last", "is_terminal", "event", "sequence", "episode", "step"),
-    *("robot_pose", "robot_radius", "humans", "leading_reward"),
+    *("robot_pose", "robot_radius", "humans", "scan_label", "contact", "leading_reward"),
 )
 """Fields handed out as stored."""
 FIELDS = ("rings", "scan", "robot_state", "goal_valid", "action", "action_valid", *STORED_FIELDS)
 """Every field that can be asked for."""
-OBSERVATION_FIELDS = frozenset({"rings", "scan", "robot_state", "goal_valid", "humans", "robot_pose"})
+OBSERVATION_FIELDS = frozenset({"rings", "scan", "robot_state", "goal_valid", "humans", "scan_label", "robot_pose"})
 """Fields that ``targets=True`` hands out as ``next_*`` too."""
 
 

@@ -11,11 +11,10 @@ import numpy as np
 from navrep_data.datasets._hub_pictures import draw_pictures
 from navrep_data.errors import CorruptDataError
 from navrep_data.io import read_json
-from navrep_data.shards import DatasetFolder, Episodes, Manifest
+from navrep_data.shards import INDEX_FILE, DatasetFolder, Episodes, Manifest, ShardEntry
 from navrep_data.shards._fields import Fields
 from navrep_data.shards.folder import ShardIndex, join_index
 
-INDEX_FILE = "index.json"
 INDEX_FORMAT = "navrep-data-index"
 _MAX_INDEX_BYTES = 256 << 20
 _COLUMNS = ("sequence", "episode", "start", "event")
@@ -56,7 +55,7 @@ def read_index(path: Path, manifest: Manifest) -> Episodes:
         if entry.file not in listed:
             raise CorruptDataError(f"{path} lacks {entry.file}; get the dataset again.")
         part = _part(listed[entry.file])
-        problem = _check_part(part, entry.rows, entry.sequences)
+        problem = _check_part(part, entry)
         if problem:
             raise CorruptDataError(f"{path}: {entry.file} {problem}; get the dataset again.")
         parts.append(part)
@@ -74,16 +73,16 @@ def _part(fields: Fields) -> ShardIndex:
     return sequence, episode, start, event.astype(np.uint8)
 
 
-def _check_part(part: ShardIndex, rows: int, sequences: tuple[int, int]) -> str:
+def _check_part(part: ShardIndex, entry: ShardEntry) -> str:
     """Return what is wrong with the index of a shard, or an empty string."""
     sequence, episode, start, event = part
     if len({len(column) for column in part}) != 1 or not len(start):
         return "has columns of different lengths, or none"
-    if start[0] != 0 or (np.diff(start) < 1).any() or start[-1] >= rows:
-        return f"has first rows that do not go up from 0 to less than {rows}"
-    if sequence[0] != sequences[0] or sequence[-1] != sequences[1] - 1 or not np.isin(np.diff(sequence), (0, 1)).all():
-        return f"has sequences other than {sequences[0]} to {sequences[1] - 1}"
-    new = np.concatenate([[True], np.diff(sequence) > 0])
+    if start[0] != 0 or (np.diff(start) < 1).any() or start[-1] >= entry.rows:
+        return f"has first rows that do not go up from 0 to less than {entry.rows}"
+    new = np.append(True, np.diff(sequence) != 0)
+    if not np.array_equal(sequence[new], entry.numbers):
+        return "has other sequences than the manifest"
     if (episode[new] != 0).any() or (np.diff(episode)[~new[1:]] != 1).any() or (event > 6).any():
         return "has episodes that are not numbered from 0, or unknown events"
     return ""

@@ -6,16 +6,18 @@ import contextlib
 import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from navrep_data.datasets import _hub_client as client
-from navrep_data.datasets._hub_extras import INDEX_FILE, check_shard_index, read_index
+from navrep_data.datasets._hub_extras import check_shard_index, read_index
 from navrep_data.datasets._hub_store import ShardStore
 from navrep_data.datasets.hub import fetch_manifest, origin_of, parse_manifest
 from navrep_data.errors import ConfigError, NavrepDataError, check_whole
 from navrep_data.io import atomic_write_json, cache_dir, is_offline, read_json
 from navrep_data.shards import (
+    INDEX_FILE,
     MANIFEST_FILE,
     DatasetFolder,
     Episodes,
@@ -255,7 +257,8 @@ def open_stream(
 
 def check_room(folder: HubFolder, sequences: int, shards: Sequence[ShardEntry]) -> None:
     """Raise ConfigError unless the shards of so many sequences fit into the cache together."""
-    fewest = min(s.sequences[1] - s.sequences[0] for s in shards[:-1] or shards)
+    # the last shard of a split may have fewer
+    fewest = min((one.count for one, after in pairwise(shards) if one.split == after.split), default=1)
     together = min(-(-sequences // fewest) + 1, len(shards))
     if together > folder.room:
         need = together * max(s.bytes for s in shards)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data.datasets import _hub_client as client
-from navrep_data.datasets._hub_extras import INDEX_FILE, make_extras
+from navrep_data.datasets._hub_extras import make_extras
 from navrep_data.datasets._hub_upload import upload
 from navrep_data.errors import (
     ConfigError,
@@ -24,6 +24,7 @@ from navrep_data.errors import (
 from navrep_data.io import fsync_dir, json_bytes, read_json, safe_join, sha256_bytes, translate_os_error
 from navrep_data.shards import (
     CARD_FILE,
+    FILE_NAME,
     MANIFEST_FILE,
     FileEntry,
     Manifest,
@@ -41,14 +42,6 @@ from navrep_data.shards.manifest import check_license
 STAGING = ".pull"
 _MAX_MANIFEST_BYTES = 256 << 20
 _MAX_CARD_BYTES = 1 << 20
-# What a manifest from outside may name: the folders of the format, plain names.
-_FILES = {
-    "shard": re.compile(r"data/[A-Za-z0-9][\w.-]{0,99}\.h5"),
-    "worlds file": re.compile(r"worlds/[A-Za-z0-9][\w.-]{0,99}\.npz"),
-    "extra": re.compile(rf"media/[A-Za-z0-9][\w.-]{{0,99}}\.(png|gif)|{re.escape(INDEX_FILE)}"),
-}
-# What a push may remove of an older version: what the format puts there, nothing that somebody added.
-_OURS = re.compile("|".join(f"({pattern.pattern})" for pattern in _FILES.values()))
 
 
 @dataclass(frozen=True)
@@ -194,7 +187,7 @@ def push(
         private=private,
         message=message or f"{whole.env}: {whole.rows:,} steps",
         token=token,
-        ours=_OURS,
+        ours=FILE_NAME,  # not what somebody added
     )
     return PushResult(
         repo=name,
@@ -230,16 +223,6 @@ def _listed(manifest: Manifest) -> list[FileEntry]:
     return [*found, *manifest.extras]
 
 
-def check_names(manifest: Manifest, at: object) -> None:
-    """Raise CorruptDataError unless all files of a manifest from outside lie where the format puts them."""
-    named = [("shard", s.file) for s in manifest.shards]
-    named += [("worlds file", s.worlds.file) for s in manifest.shards if s.worlds]
-    named += [("extra", e.file) for e in manifest.extras]
-    for kind, name in named:
-        if not _FILES[kind].fullmatch(name):
-            raise CorruptDataError(f"{at} names a {kind} {name!r}, expected a plain name in its folder.")
-
-
 def fetch_manifest(at: client.Revision, folder: Path | None) -> tuple[Manifest, dict[str, client.RemoteFile]]:
     """Return the manifest of a commit, checked, and all files that the Hub has at that commit.
 
@@ -273,7 +256,6 @@ def fetch_manifest(at: client.Revision, folder: Path | None) -> tuple[Manifest, 
 def parse_manifest(at: client.Revision, path: Path) -> Manifest:
     """Return the manifest in the file that came from the Hub, checked; see :func:`fetch_manifest`."""
     manifest = Manifest.from_dict(read_json(path), Path(f"{at.repo}"))
-    check_names(manifest, at)
     if not manifest.complete:
         raise DatasetError(f"{at} holds an unfinished dataset, expected one that `navrep-data push` put there.")
     return manifest

@@ -1,6 +1,6 @@
 """Datasets of codes: what V sees of every row, stored once, so that M trains without the lidar.
 
-A folder like a dataset's: ``manifest.json`` and ``data/shard-00000.h5`` with top-level columns of equal length: ``mu``,
+A folder like a dataset's: ``manifest.json`` and ``data/train-00000.h5`` with top-level columns of equal length: ``mu``,
 ``logvar`` and copies of the source's ``robot_state``, ``action``, ``reward``, flags and indices. The manifest names the
 encoder by the hash of its weights, and the dataset by that of its content.
 """
@@ -33,10 +33,10 @@ from navrep_data.errors import (
 )
 from navrep_data.io import atomic_write_bytes, json_bytes, read_json, reading, safe_join, sha256_bytes
 from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, SensorContract
-from navrep_data.shards import SPLITS, Episodes, shard_file
+from navrep_data.shards import SPLITS, Episodes
 
 FORMAT_NAME = "navrep-data-latents"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MANIFEST_FILE = "manifest.json"
 _MAX_Z = 512
 _MAX_SHARD_BYTES = 1 << 34
@@ -67,13 +67,13 @@ _FIELDS = (
 
 @dataclass(frozen=True)
 class LatentShard:
-    """One file of codes: its name, hash, size, rows and sequences [first, stop)."""
+    """One file of codes: its name, hash, size, rows and split."""
 
     file: str
     sha256: str
     bytes: int
     rows: int
-    sequences: tuple[int, int]
+    split: str
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,6 @@ class LatentManifest:
         ``content_hash``, ``env``, ``physics``, ``rows`` of the dataset that was encoded.
     sensor : dict
         Its sensor contract.
-    splits : dict
-        Its splits: ranges [start, stop) of sequences by name.
     shards : tuple of LatentShard
         Finished files.
     complete : bool
@@ -102,7 +100,6 @@ class LatentManifest:
     encoder: dict[str, Any]
     source: dict[str, Any]
     sensor: dict[str, Any]
-    splits: dict[str, list[list[int]]]
     shards: tuple[LatentShard, ...] = field(default=())
     complete: bool = False
 
@@ -164,18 +161,16 @@ class LatentManifest:
             raise ValueError(f"z_size {z_size!r}")
         shards = []
         for entry in found["shards"]:
-            first, stop = (int(n) for n in entry["sequences"])
             shard = LatentShard(
-                str(entry["file"]), str(entry["sha256"]), int(entry["bytes"]), int(entry["rows"]), (first, stop)
+                str(entry["file"]), str(entry["sha256"]), int(entry["bytes"]), int(entry["rows"]), str(entry["split"])
             )
             safe_join(root, shard.file)
-            if not 0 < shard.bytes <= _MAX_SHARD_BYTES or shard.rows < 1 or not 0 <= first < stop:
+            if not 0 < shard.bytes <= _MAX_SHARD_BYTES or shard.rows < 1 or shard.split not in SPLITS:
                 raise ValueError(f"shard {shard.file}")
             shards.append(shard)
         SensorContract(**found["sensor"])
-        splits = {str(name): [[int(a), int(b)] for a, b in ranges] for name, ranges in found["splits"].items()}
         dicts = [dict(found[name]) for name in ("encoder", "source", "sensor")]
-        return cls(z_size, dicts[0], dicts[1], dicts[2], splits, tuple(shards), bool(found["complete"]))
+        return cls(z_size, dicts[0], dicts[1], dicts[2], tuple(shards), bool(found["complete"]))
 
 
 def latent_shard_bytes(columns: Mapping[str, Array]) -> bytes:
@@ -187,13 +182,12 @@ def latent_shard_bytes(columns: Mapping[str, Array]) -> bytes:
     return memory.getvalue()
 
 
-def write_latent_shard(root: Path, index: int, columns: Mapping[str, Array], sequences: tuple[int, int]) -> LatentShard:
-    """Write one shard atomically and return its entry for the manifest."""
+def write_latent_shard(root: Path, name: str, split: str, columns: Mapping[str, Array]) -> LatentShard:
+    """Write the codes of the shard `name` of a dataset atomically and return the entry for the manifest."""
     data = latent_shard_bytes(columns)
-    name = shard_file(index)
     (root / name).parent.mkdir(parents=True, exist_ok=True)
     atomic_write_bytes(root / name, data)
-    return LatentShard(name, hashlib.sha256(data).hexdigest(), len(data), len(columns["mu"]), sequences)
+    return LatentShard(name, hashlib.sha256(data).hexdigest(), len(data), len(columns["mu"]), split)
 
 
 def read_latent_shard(root: Path, shard: LatentShard, z_size: int) -> dict[str, Array]:
@@ -300,20 +294,18 @@ class LatentDataset(Dataset[Batch]):
 
     def _load(self, split: str | None) -> tuple[dict[str, Array], Episodes]:
         """Return the rows of the sequences of a split, one after the other, and the episodes in them."""
-        ranges = None if split is None else self.manifest.splits.get(split, [])
-        parts = []
-        for shard in sorted(self.manifest.shards, key=lambda s: s.sequences):
-            columns = read_latent_shard(self.root, shard, self.manifest.z_size)
-            if ranges is not None:
-                inside = np.zeros(shard.rows, bool)
-                for low, high in ranges:
-                    inside |= (columns["sequence"] >= low) & (columns["sequence"] < high)
-                columns = {name: values[inside] for name, values in columns.items()}
-            parts.append(columns)
+        parts = [
+            read_latent_shard(self.root, shard, self.manifest.z_size)
+            for shard in self.manifest.shards
+            if split in (None, shard.split)
+        ]
         rows = {name: np.concatenate([part[name] for part in parts]) if parts else np.zeros(0) for name in _COLUMNS}
         if len(rows["mu"]) == 0:
             what = "no rows" if split is None else f"nothing in split {split!r}"
             raise ConfigError(f"{self.root} has {what}. Encode more, or choose another split.")
+        if split is None:  # windows are cut from sequences in the order of their numbers
+            order = np.argsort(rows["sequence"], kind="stable")
+            rows = {name: values[order] for name, values in rows.items()}
         start = np.flatnonzero(rows["is_first"])
         if start[:1].tolist() != [0]:
             raise CorruptDataError(f"{self.root} does not start with an episode's first row; encode again.")

@@ -32,10 +32,11 @@ from navrep_data.schema import (
     N_RAYS,
     RANGE_MAX,
     ROBOT_STATE_SIZE,
+    SIMULATED_COLUMNS,
     Event,
     SensorContract,
 )
-from navrep_data.shards import Manifest, ShardEntry, ShardWriter, dataset_card, publish
+from navrep_data.shards import DatasetWriter, Manifest, split_of
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -66,7 +67,7 @@ _EXPECTED: dict[str, tuple[tuple[int, ...], Dtypes]] = {
     "rewards": ((), _FLOATS),
     "dones": ((), _FLAGS),
 }
-_COLUMNS = tuple(name for name in COLUMNS if name != "humans")
+_COLUMNS = tuple(name for name in COLUMNS if name not in SIMULATED_COLUMNS)
 
 
 def _array(archive: zipfile.ZipFile, name: str, path: Path, read: bool) -> tuple[int, npt.NDArray[Any] | None]:
@@ -394,23 +395,9 @@ def _write(
     progress: Callable[[int, int], None] | None,
 ) -> Manifest:
     """Write all shards, the card and the manifest."""
-    shards: list[ShardEntry] = []
-    for first in range(0, len(files), manifest.shard_size):
-        writer = ShardWriter(
-            env=manifest.env,
-            config=manifest.config,
-            seed=manifest.seed,
-            sensor=manifest.sensor,
-            scan_dtype=manifest.scan_dtype,
-            columns=manifest.columns,
-            max_humans=manifest.max_humans,
-            length=manifest.length,
-            first_sequence=first,
-        )
-        for sequence in range(first, min(first + manifest.shard_size, len(files))):
-            writer.append(_sequence(files[sequence], sequence, range_max, rings))
-            if progress is not None:
-                progress(sequence + 1, len(files))
-        shards.append(publish(root, len(shards), writer.finish()))
-    manifest = manifest.with_shards(shards, complete=True)
-    return manifest.save(root, dataset_card(manifest))
+    writer = DatasetWriter(root, manifest)
+    for number, file in enumerate(files):
+        writer.append(number, split_of(number), _sequence(file, number, range_max, rings))
+        if progress is not None:
+            progress(number + 1, len(files))
+    return writer.finish()

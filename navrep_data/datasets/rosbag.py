@@ -24,8 +24,8 @@ from navrep_data.errors import ConfigError, DatasetError, check_whole, one_line
 from navrep_data.io import new_folder, sha256_bytes, sha256_file
 from navrep_data.observations import scan_to_rings
 from navrep_data.observations.blind import declaration, runs_of
-from navrep_data.schema import COLUMNS, DT, MAX_COORDINATE, RANGE_MAX, SensorContract
-from navrep_data.shards import Manifest, ShardEntry, ShardWriter, dataset_card, publish
+from navrep_data.schema import COLUMNS, DT, MAX_COORDINATE, RANGE_MAX, SIMULATED_COLUMNS, SensorContract
+from navrep_data.shards import DatasetWriter, Manifest, split_of
 
 Arrays = dict[str, npt.NDArray[Any]]
 Ints = npt.NDArray[np.int64]
@@ -38,7 +38,7 @@ LARGEST_GAP = 1.5
 # Drivers are late now and then, not by half.
 _SLOW = 1.05
 MAX_LENGTH = 100_000
-_COLUMNS = tuple(name for name in COLUMNS if name != "humans")
+_COLUMNS = tuple(name for name in COLUMNS if name not in SIMULATED_COLUMNS)
 _NANOSECONDS = 1_000_000_000
 
 
@@ -156,7 +156,7 @@ def import_rosbag(
     where scans or odometry have none, or stamps of two clocks), each with the nearest scan and odometry; the scan is
     seen from the robot's centre with the usual 1080 rays (:class:`ScanAdapter`), each by its own description, 0 where
     nobody saw anything; poses are kept, less a whole number of metres where they lie beyond 16 km, as `note` tells and
-    ``pose_origin`` in the manifest's config. Goals in another frame are taken to the odometry's by ``/tf`` and
+    ``origins`` of the manifest. Goals in another frame are taken to the odometry's by ``/tf`` and
     ``/tf_static`` as of when they came.
 
     An episode ends where its goal is reached (``goal``), or another goal comes, the sequence is full, or scans or
@@ -194,7 +194,7 @@ def import_rosbag(
         )  # fmt: skip
         manifest = _plan(recordings, env, sensor, length, rings, goal_radius, blind, command)
         if origin is not None:
-            manifest = replace(manifest, config={**manifest.config, "pose_origin": list(origin)})
+            manifest = replace(manifest, origins={"recording": origin})
         return _write(part, manifest, recordings, rings, progress)
 
 
@@ -227,7 +227,7 @@ def near_zero(
     x, y = (float(v) for v in np.rint(poses[0][0, :2]))
     say(
         f"poses lie beyond {MAX_COORDINATE:.0f} m of 0, where float32 loses millimetres: they are stored less "
-        f"({x:.0f}, {y:.0f}) m, which the manifest holds as pose_origin"
+        f"({x:.0f}, {y:.0f}) m, which the manifest holds under origins"
     )
     shift = np.array([x, y, 0.0])
     return [replace(r, pieces=[replace(p, pose=p.pose - shift) for p in r.pieces]) for r in recordings], (x, y)
@@ -407,20 +407,12 @@ def _write(
     progress: Callable[[int, int], None] | None,
 ) -> Manifest:
     """Write all shards, the card and the manifest."""
-    shards: list[ShardEntry] = []
-    sequences = _sequences(recordings, manifest.sensor, rings)
-    for first in range(0, manifest.planned, manifest.shard_size):
-        writer = ShardWriter(
-            env=manifest.env, config=manifest.config, seed=manifest.seed, sensor=manifest.sensor,
-            scan_dtype=manifest.scan_dtype, columns=manifest.columns, max_humans=manifest.max_humans,
-            length=manifest.length, first_sequence=first,
-        )  # fmt: skip
-        for number in range(first, min(first + manifest.shard_size, manifest.planned)):
-            writer.append(next(sequences))
-            if progress is not None:
-                progress(number + 1, manifest.planned)
-        shards.append(publish(root, len(shards), writer.finish()))
-    return (m := manifest.with_shards(shards, complete=True)).save(root, dataset_card(m))
+    writer = DatasetWriter(root, manifest)
+    for number, columns in enumerate(_sequences(recordings, manifest.sensor, rings)):
+        writer.append(number, split_of(number), columns)
+        if progress is not None:
+            progress(number + 1, manifest.planned)
+    return writer.finish()
 
 
 def parse_mount(text: str) -> tuple[float, ...]:

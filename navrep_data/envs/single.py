@@ -126,8 +126,9 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             Which one; see the class's notes.
         options : dict, optional
             ``{"episode": k}``: number k of the environment's numbered episodes. ``{"start": (x, y) or (x, y, theta),
-            "goal": (x, y)}``, either or both: where the robot starts and wants to go [m, rad], world frame, in the
-            world that is drawn otherwise; refused where it is not free. One robot; no goals in scenarios.
+            "goal": (x, y)}``, either or both: where the robot starts and wants to go [m, rad], on maps in the
+            frame of the file, in the world that is drawn otherwise; refused where it is not free. One robot; no goals
+            in scenarios.
 
         Returns
         -------
@@ -182,7 +183,7 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _observe(self) -> Observation:
         batch = self._worlds.observe()
         self._scan = batch["scan"][0]
-        self._trail.append(self._worlds.robots()[0].reshape(-1, 3)[:, :2])
+        self._trail.append(self._worlds.drawn_robots()[0, :, :2])
         if self.render_mode == "human":
             self._show()
         return {name: values[0].copy() for name, values in batch.items()}

@@ -262,8 +262,8 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         observations = self._worlds.observe()
         if self.render_mode is not None:
             self._scans = observations["scan"].copy()
-            for trail, robots in zip(self._trails, self._worlds.robots(), strict=True):
-                trail.append(robots.reshape(-1, 3)[:, :2])
+            for trail, robots in zip(self._trails, self._worlds.drawn_robots(), strict=True):
+                trail.append(robots[:, :2])
         return observations
 
     def _infos(self, mask: Mask, rewards: F64 | None = None, stepped: Mask | None = None) -> Infos:

@@ -187,7 +187,10 @@ class Worlds:
         chosen = mask.copy()
         self._draw(mask)
         if places is not None:
-            self.sim.place(*places, chosen)
+            # users speak of places in the frame of the map's file
+            starts, goals = places
+            origins = self.sim.origins
+            self.sim.place(starts - np.pad(origins, ((0, 0), (0, 1))), goals - origins, chosen)
 
     def _draw(self, mask: Mask) -> None:
         self.events[mask] = 0
@@ -233,15 +236,22 @@ class Worlds:
         return {"scan": scans, "robot_state": states}
 
     def robots(self) -> F64:
-        """Return x, y [m], theta [rad] of the robots, (n, 3) or (n, robots, 3), world frame."""
+        """Return x, y [m], theta [rad] of the robots, (n, 3) or (n, robots, 3), on maps in the frame of the file."""
+        poses = self.drawn_robots()
+        poses[:, :, :2] += self.sim.origins[:, None]
+        return poses if self._lead else poses[:, 0]
+
+    def drawn_robots(self) -> F64:
+        """Return x, y [m], theta [rad] of the robots, (n, robots, 3), in the frame of the simulator's states."""
         agents: F64 = self.sim.arrays.agents
-        return agents[:, 0, _POSE] if not self._lead else agents[:, : self._lead[0], _POSE]
+        return agents[:, : self.config.robots, _POSE]
 
     def humans(self) -> F64:
-        """Return x, y [m], vx, vy [m/s] of the humans, (n, most humans, 4), world frame; NaN in empty slots."""
+        """Return x, y [m], vx, vy [m/s] of the humans, (n, most humans, 4), as :meth:`robots`; NaN in empty slots."""
         first = self.config.robots
         agents: F64 = self.sim.arrays.agents
         out = agents[:, first:, _MOTION].copy()
+        out[..., :2] += self.sim.origins[:, None]
         out[np.arange(out.shape[1]) >= self.human_counts()[:, None]] = np.nan
         return out
 

@@ -81,8 +81,9 @@ class ScenarioWorlds:
         return self.simulator.robot_states()
 
     def poses(self) -> F64:
-        """Return x, y, theta of the robots (W, 3)."""
+        """Return x, y, theta of the robots (W, 3), in the frame of the map's file."""
         poses: F64 = self._state.agents[:, 0, [lay.A_X, lay.A_Y, lay.A_HEADING]]
+        poses[:, :2] += self.simulator.origins
         return poses
 
     def radii(self) -> F64:
@@ -115,9 +116,9 @@ class ScenarioWorlds:
         return self._velocities
 
     def targets(self) -> F64:
-        """Return points (W, 2) about a metre ahead on the planned way."""
+        """Return points (W, 2) about a metre ahead on the planned way, in the frame of the map's file."""
         assert self._maps is not None
-        return self._maps.ways_ahead()
+        return self._maps.ways_ahead() + self.simulator.origins
 
     def speed(self) -> float:
         """Return the velocity that an action of 1 stands for [m/s]."""

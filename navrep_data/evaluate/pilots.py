@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
-import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -162,15 +159,6 @@ class ZooPilot(FunctionPilot):
             self._policy.reset(batch_size=BLOCK, seed=self._first_seed + first)
         else:
             super().start(worlds, mask, episodes)
-
-
-def source_hash(function: Callable[..., Any]) -> str:
-    """Return the SHA-256 of the file that a function or object comes from, empty where there is none."""
-    try:
-        file = inspect.getsourcefile(function if inspect.isroutine(function) else type(function))
-        return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
-    except (TypeError, OSError):
-        return ""
 
 
 def _fill_up(rows: NDArray[Any]) -> NDArray[Any]:

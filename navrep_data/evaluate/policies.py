@@ -11,7 +11,8 @@ from typing import Any
 
 from navrep_data.errors import ConfigError, PolicyError, UnknownNameError, did_you_mean
 from navrep_data.evaluate.baselines import DwaPilot, GoalPilot, OrcaPilot, RandomPilot
-from navrep_data.evaluate.pilots import FunctionPilot, Pilot, ZooPilot, source_hash
+from navrep_data.evaluate.pilots import FunctionPilot, Pilot, ZooPilot
+from navrep_data.generate.inputs import source_hash
 from navrep_data.generate.policy import load_callable
 from navrep_data.io import sha256_file
 from navrep_data.schema import INFERENCE, RANGES, SCALING

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from navrep_data.generate.worker import DatasetSpec, new_writer
 from navrep_data.kernels import is_missing
+from navrep_data.shards import SPLITS
 from navrep_data.sim import RolloutSettings, ScriptedPolicy, ScriptedRollout, make_config
 from navrep_data.sim._rollout import rollout_sequence
 
@@ -93,8 +94,8 @@ def compile_ahead(spec: DatasetSpec) -> None:
         rollout = ScriptedRollout(short.config, short.settings, ScriptedPolicy("orca"), seed=0)
         for kernel, arguments in rollout.parts()[1]:
             kernel.prepare(arguments)
-        writer = new_writer(short, 0)
-        writer.append(rollout.blank())
+        writer = new_writer(short, SPLITS[0])
+        writer.append(0, rollout.blank())
         writer.finish()
         helper.wait()
     finally:

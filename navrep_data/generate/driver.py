@@ -12,7 +12,7 @@ from typing import Any
 
 from navrep_data.errors import ConfigError, DatasetMismatchError, check_whole
 from navrep_data.generate.executors import EXECUTORS, LocalExecutor, RayExecutor
-from navrep_data.generate.maps import named_from
+from navrep_data.generate.inputs import named_from
 from navrep_data.generate.parts import Part, parse_part
 from navrep_data.generate.plan import Request, check_folder, check_same, check_settings, make_request
 from navrep_data.generate.policy import load_callable, make_policy
@@ -85,6 +85,7 @@ def generate(
     scan_dtype: str | None = None,
     rings: bool = True,
     humans_column: bool = True,
+    labels: bool = False,
     executor: str = "local",
     address: str | None = None,
     storage: str | None = None,
@@ -128,8 +129,8 @@ def generate(
         Sequences per shard; about 20,000 rows by default.
     scan_dtype : {"uint16", "float32"}, optional
         Millimetres or metres; uint16 where the range fits.
-    rings, humans_column : bool
-        Whether to store these columns.
+    rings, humans_column, labels : bool
+        Whether to store these columns (labels: ``scan_label``, what each ray hit).
     executor : {"local", "ray"}
         Where shards are made: on this machine, or as tasks of a Ray cluster (needs the extra ``ray``).
     address : str, optional
@@ -183,7 +184,7 @@ def generate(
     if executor != "local":
         root = root.absolute()  # workers elsewhere have other working folders
     config = named_from(config, root)
-    settings = check_settings(config, length, scan_dtype, rings, humans_column)
+    settings = check_settings(config, length, scan_dtype, rings, humans_column, labels)
     request = make_request(root, config, settings, chosen, seed, n, shard_size, storage, part)
     request = replace(
         request, command=_command(request, env, physics, humans, obstacles, legs, maps, shard_size, scan_dtype)
@@ -280,6 +281,7 @@ def _command(
     for flag, value in (("--shard-size", shard_size), ("--scan-dtype", scan_dtype)):
         if value is not None:
             words += [flag, str(value)]
+    words += ["--labels"] if spec.settings.labels else []
     words += [] if spec.settings.rings else ["--no-rings"]
     words += [] if spec.settings.humans or not spec.config.max_others else ["--no-humans-column"]
     return shlex.join(words)

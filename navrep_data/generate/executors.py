@@ -14,6 +14,7 @@ from typing import Any
 
 from navrep_data._ray import RayCluster
 from navrep_data.errors import FolderNotWritableError, PolicyError, WorkerDiedError
+from navrep_data.generate.inputs import check_here
 from navrep_data.generate.plan import versions
 from navrep_data.generate.worker import (
     DatasetSpec,
@@ -98,21 +99,21 @@ class LocalExecutor:
     def _run_pool(self, tasks: list[ShardTask]) -> Iterator[Finished | None]:
         restarts = 0
         while tasks:
-            done: set[int] = set()
+            done: set[str] = set()
             try:
                 for finished in self._run_once(tasks):
                     if finished is not None:
-                        done.add(finished[0].index)
+                        done.add(finished[0].file)
                     yield finished
                 return
             except BrokenProcessPool:
-                tasks = [task for task in tasks if task.index not in done]
+                tasks = [task for task in tasks if task.file not in done]
                 restarts = 0 if done else restarts + 1
                 if restarts > MAX_RESTARTS:
                     raise WorkerDiedError(
-                        f"Worker processes died {restarts} times before finishing shard {tasks[0].index} (killed, or "
-                        "out of memory?). What was finished is intact; run the same command again, "
-                        "perhaps with fewer --workers."
+                        f"Worker processes died {restarts} times before finishing {tasks[0].file} (killed, out of "
+                        "memory, or started by a script without `if __name__ == '__main__':`?). What was finished is "
+                        "intact; run the same again, perhaps with fewer --workers."
                     ) from None
                 for slot in range(len(self._counters)):
                     self._counters[slot] = 0
@@ -163,6 +164,7 @@ def _run_remote(spec: DatasetSpec, task: ShardTask) -> tuple[ShardEntry, dict[st
         )
     # such a worker may get the tasks of one dataset after the other
     if "rollout" not in _kept or _kept["spec"] != spec:
+        check_here(spec.inputs, spec.config, spec.policy, f"on node {platform.node()}")
         _kept["spec"], _kept["rollout"] = spec, rollout_of(spec)
     return make_shard(spec, task, _kept["rollout"], lambda rows: None), versions()
 

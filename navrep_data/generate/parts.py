@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data.errors import ConfigError, DatasetError, DatasetMismatchError, DatasetNotFoundError
-from navrep_data.generate.maps import check_one_map_each
 from navrep_data.generate.storage import FolderStore
+from navrep_data.generate.worker import ShardTask, all_shards
 from navrep_data.shards import MANIFEST_FILE, Manifest, ShardEntry, dataset_card, writer_lock
 
 PARTS = "parts"
@@ -25,7 +25,7 @@ _FOLDER = re.compile(r"([0-9]{4})-of-([0-9]{5})")
 # What every part must say alike; `versions` are compared one by one.
 _SAME = (
     "env", "physics", "seed", "length", "planned", "shard_size", "scan_dtype", "columns", "max_humans", "sensor",
-    "config", "policy", "command", "format_version",
+    "config", "policy", "inputs", "origins", "command", "format_version",
 )  # fmt: skip
 # Nodes of one cluster may differ in these; the last digits may then too, as when a dataset is extended elsewhere.
 _HARDWARE = ("cpu", "machine")
@@ -50,9 +50,10 @@ class Part:
         """Its folder inside the dataset."""
         return f"{PARTS}/{self.index:04d}-of-{self.count:05d}"
 
-    def shards(self, total: int) -> range:
-        """Return its share of `total` shards, as even as can be."""
-        return range(self.index * total // self.count, (self.index + 1) * total // self.count)
+    def share(self, shards: list[ShardTask]) -> list[ShardTask]:
+        """Return its share of all shards, as even as can be."""
+        total = len(shards)
+        return shards[self.index * total // self.count : (self.index + 1) * total // self.count]
 
     def __str__(self) -> str:
         return f"{self.index}/{self.count}"
@@ -116,7 +117,6 @@ def merge_manifest(root: Path | str, report: Callable[[str], None] | None = None
         _check_all(found)
         entries = [entry for _, manifest in found for entry in manifest.shards]
         _check_files(root, entries)
-        check_one_map_each(root, found)
         merged = first.with_shards(entries, complete=True)
         merged = merged.save(root, dataset_card(merged))
         shutil.rmtree(root / PARTS)
@@ -181,12 +181,13 @@ def _check_all(found: Sequence[tuple[Part, Manifest]]) -> None:
     size, n = first.shard_size, first.planned
     there = {part.index for part, _ in found}
     lacking = [f"{k}/{count} (no manifest)" for k in range(count) if k not in there]
+    shards = all_shards(n, size)
     for part, manifest in found:
-        wanted = {(k * size, min((k + 1) * size, n)) for k in part.shards(-(-n // size))}
-        have = {entry.sequences for entry in manifest.shards}
+        wanted = {(task.file, task.sequences) for task in part.share(shards)}
+        have = {(entry.file, entry.sequences) for entry in manifest.shards}
         if have - wanted:
             raise DatasetMismatchError(
-                f"Part {part} lists sequences {min(have - wanted)}, which are not its own: parts overlap; expected "
+                f"Part {part} lists {min(have - wanted)[0]}, which is not its own: parts overlap; expected "
                 f"what --shard-range {part} makes. Remove {part.folder} and run its job again."
             )
         if have != wanted:

@@ -6,6 +6,7 @@ import platform
 import shutil
 import sys
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,14 +20,14 @@ from navrep_data.errors import (
     FolderNotWritableError,
     check_whole,
 )
-from navrep_data.generate.maps import check_unchanged
+from navrep_data.generate.inputs import check_unchanged, inputs_of, origins_of
 from navrep_data.generate.parts import PARTS, Part
 from navrep_data.generate.policy import PolicySpec
 from navrep_data.generate.storage import STAGING
-from navrep_data.generate.worker import DatasetSpec
+from navrep_data.generate.worker import DatasetSpec, ShardTask, all_shards
 from navrep_data.io import PART_SUFFIX
 from navrep_data.io._files import MAX_JSON_BYTES
-from navrep_data.schema import COLUMNS, UINT16_RANGE_LIMIT
+from navrep_data.schema import COLUMNS, MAX_LABELLED, UINT16_RANGE_LIMIT
 from navrep_data.shards import LOCK_FILE, MANIFEST_FILE, MAX_SHARD_BYTES, Manifest, estimate_bytes
 from navrep_data.sim import RolloutSettings, SimConfig
 from navrep_data.sim.config import complete as complete_config
@@ -58,16 +59,16 @@ class Request:
         """The folder of the manifest: the dataset's own, but for parts."""
         return self.spec.root if self.part is None else self.spec.root / self.part.folder
 
-    @property
-    def shards(self) -> range:
-        """The numbers of the shards that are asked for: all, but for parts."""
-        count = -(-self.n // self.shard_size)
-        return range(count) if self.part is None else self.part.shards(count)
+    @cached_property
+    def shards(self) -> list[ShardTask]:
+        """The shards that are asked for: all, but for parts."""
+        everything = all_shards(self.n, self.shard_size)
+        return everything if self.part is None else self.part.share(everything)
 
     @property
     def sequences(self) -> int:
         """Number of sequences in these shards."""
-        return min(self.shards.stop * self.shard_size, self.n) - min(self.shards.start * self.shard_size, self.n)
+        return self.n if self.part is None else sum(task.stop - task.first for task in self.shards)
 
     @property
     def rows(self) -> int:
@@ -96,7 +97,7 @@ def bytes_per_row(spec: DatasetSpec) -> float:
 
 
 def check_settings(
-    config: SimConfig, length: int, scan_dtype: str | None, rings: bool, humans: bool
+    config: SimConfig, length: int, scan_dtype: str | None, rings: bool, humans: bool, labels: bool = False
 ) -> RolloutSettings:
     """Return the settings of the rows; chooses float32 scans by itself where millimetres do not fit 16 bits."""
     far = config.sensor.range_max > UINT16_RANGE_LIMIT
@@ -108,10 +109,15 @@ def check_settings(
             f"{config.sensor.range_max:g} m; use float32."
         )
     check_rings(config, rings)
+    if labels and config.max_humans > MAX_LABELLED:
+        raise ConfigError(
+            f"--labels with up to {config.max_humans} humans: a label has 8 bits, expected at most {MAX_LABELLED}."
+        )
     chosen = scan_dtype or ("float32" if far else "uint16")
     return RolloutSettings(
-        check_whole("--length", length, 1, MAX_LENGTH), chosen, rings, humans and config.max_others > 0
-    )
+        check_whole("--length", length, 1, MAX_LENGTH), chosen, rings, humans and config.max_others > 0, labels,
+        contact=config.on_collision == "damage",
+    )  # fmt: skip
 
 
 def make_request(
@@ -120,12 +126,10 @@ def make_request(
 ) -> Request:  # fmt: skip
     """Return the checked request; chooses the shard size where none is given."""
     n = check_whole("--n", n, 1, MAX_SEQUENCES)
-    columns = tuple(
-        name
-        for name in _GENERATED_COLUMNS
-        if (name != "rings" or settings.rings) and (name != "humans" or settings.humans)
-    )
-    spec = DatasetSpec(root, config, settings, policy, seed, columns, storage)
+    chosen = {"rings": settings.rings, "scan_label": settings.labels, "contact": settings.contact,
+              "humans": settings.humans}  # fmt: skip
+    columns = tuple(name for name in _GENERATED_COLUMNS if chosen.get(name, True))
+    spec = DatasetSpec(root, config, settings, policy, seed, columns, storage, inputs_of(config, policy))
     largest = largest_shard(spec)
     if shard_size is None:
         shard_size = min(largest, max(policy.batch, DEFAULT_SHARD_ROWS // settings.length, 1))
@@ -190,6 +194,8 @@ def new_manifest(request: Request) -> Manifest:
         sensor=spec.config.sensor,
         config=spec.config.to_dict(),
         policy=spec.policy.to_dict(),
+        inputs=dict(spec.inputs),
+        origins=origins_of(spec.config),
         versions=versions(),
         command=request.command,
     )
@@ -271,7 +277,7 @@ def check_same(old: Manifest, request: Request, explicit_shard_size: bool) -> No
                 f"{request.spec.root} was made with {field}={seen}, asked for {field}={asked}; "
                 "repeat the old setting to go on with it, or choose another --out."
             )
-    check_unchanged(request.spec.root, old, request.spec.config)
+    check_unchanged(request.spec.root, old, request.spec.config, request.spec.inputs)
     if request.n < old.planned:
         raise DatasetMismatchError(
             f"{request.spec.root} was made with n={old.planned}, asked for n={request.n}; a dataset only grows: "

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from navrep_data.errors import ConfigError, DatasetError, check_whole
-from navrep_data.generate.maps import find_maps
+from navrep_data.generate.inputs import check_policy, find_maps, inputs_of
 from navrep_data.generate.policy import PolicySpec, make_rollout
 from navrep_data.generate.worker import DatasetSpec, new_writer
 from navrep_data.schema import SCAN_SCALE
@@ -83,7 +83,7 @@ def recipe_of(root: Path, manifest: Manifest, maps: Sequence[str] = ()) -> Datas
     ConfigError, PolicyError
         If this version cannot simulate it, or its policy cannot be imported.
     MapError, DatasetMismatchError
-        If a map is not found, or is not the one that it was made on.
+        If a map is not found, or it or the policy is not the one that it was made with.
     """
     if manifest.source:
         raise DatasetError(f"{root} was made out of other datasets ({manifest.command}); regenerate from those.")
@@ -91,8 +91,9 @@ def recipe_of(root: Path, manifest: Manifest, maps: Sequence[str] = ()) -> Datas
         raise DatasetError(f"{root} was not made by `navrep-data generate`; there is no recipe to make it again from.")
     config = find_maps(root, manifest, SimConfig.from_dict(manifest.config), maps)
     settings = RolloutSettings(
-        manifest.length, manifest.scan_dtype, "rings" in manifest.columns, "humans" in manifest.columns
-    )
+        manifest.length, manifest.scan_dtype,
+        *(name in manifest.columns for name in ("rings", "humans", "scan_label", "contact")),
+    )  # fmt: skip
     name = str(manifest.policy["name"])
     policy = PolicySpec(name, int(manifest.policy.get("batch", 1)))
     if policy.scripted and policy.to_dict() != manifest.policy:
@@ -100,7 +101,8 @@ def recipe_of(root: Path, manifest: Manifest, maps: Sequence[str] = ()) -> Datas
             f"{root} was made with policy settings {manifest.policy}, this version has "
             f"{ScriptedPolicy(name).to_dict()}; use the version in its manifest."
         )
-    return DatasetSpec(root, config, settings, policy, manifest.seed, manifest.columns)
+    check_policy(root, manifest, inputs_of(config, policy))
+    return DatasetSpec(root, config, settings, policy, manifest.seed, manifest.columns, inputs=manifest.inputs)
 
 
 def regenerate(root: Path | str, k: int, seed: int | None = None, maps: Sequence[str] = ()) -> RegenerateReport:
@@ -130,7 +132,7 @@ def regenerate(root: Path | str, k: int, seed: int | None = None, maps: Sequence
     DatasetError, ConfigError, PolicyError
         If the dataset cannot be made again.
     MapError, DatasetMismatchError
-        If a map is not found, or is not the one that the dataset was made on.
+        If a map is not found, or it or the policy is not the one that the dataset was made with.
     CorruptDataError
         If a shard is damaged.
     """
@@ -139,29 +141,28 @@ def regenerate(root: Path | str, k: int, seed: int | None = None, maps: Sequence
     with DatasetFolder(root) as folder:
         manifest = folder.manifest
         spec = recipe_of(root, manifest, maps)
-        everything = [s for entry in manifest.shards for s in range(*entry.sequences)]
+        everything = sorted(number for entry in manifest.shards for number in entry.numbers)
         chosen = sorted(random.Random(seed).sample(everything, min(k, len(everything))))
         rollout = make_rollout(spec.config, spec.settings, spec.policy, spec.seed)
         comparisons = []
         for sequence in chosen:
-            index, entry = _shard_of(manifest, sequence)
-            first = entry.sequences[0] + (sequence - entry.sequences[0]) // rollout.batch * rollout.batch
-            group = range(first, min(first + rollout.batch, entry.sequences[1]))
-            columns, worlds = rollout.run(group)[sequence - first]
-            comparisons.append(_compare(folder, spec, index, entry, sequence, columns, worlds))
+            place = manifest.place_of(sequence)
+            assert place is not None
+            shard, at = place
+            first = at // rollout.batch * rollout.batch
+            group = manifest.shards[shard].numbers[first : first + rollout.batch]
+            columns, worlds = rollout.run(group)[at - first]
+            comparisons.append(_compare(folder, spec, place, columns, worlds))
     return RegenerateReport(comparisons)
 
 
-def _shard_of(manifest: Manifest, sequence: int) -> tuple[int, ShardEntry]:
-    return next((i, e) for i, e in enumerate(manifest.shards) if e.sequences[0] <= sequence < e.sequences[1])
-
-
 def _compare(
-    folder: DatasetFolder, spec: DatasetSpec, index: int, entry: ShardEntry, sequence: int,
+    folder: DatasetFolder, spec: DatasetSpec, place: tuple[int, int],
     columns: dict[str, npt.NDArray[Any]], worlds: dict[str, npt.NDArray[Any]],
 ) -> SequenceComparison:  # fmt: skip
-    length = spec.settings.length
-    start = (sequence - entry.sequences[0]) * length
+    (index, at), length = place, spec.settings.length
+    entry = folder.manifest.shards[index]
+    sequence, start = entry.numbers[at], at * length
     counts: dict[str, int] = {}
     largest = 0.0
     for name in spec.columns:
@@ -175,10 +176,10 @@ def _compare(
                 size = np.abs(old[~same].astype(np.float64) - new[~same].astype(np.float64)) * scale
                 largest = max(largest, float(np.nan_to_num(size, nan=np.inf).max()))
     if not counts:
-        listed = entry.sequence_hashes[sequence - entry.sequences[0]]
+        listed = entry.sequence_hashes[at]
         if sequence_hash({name: columns[name] for name in spec.columns}) != listed:
             return SequenceComparison(sequence, DIFFERENT, columns={"sequence_hashes": 1})
-        same_bytes = _same_chunks(spec, entry, sequence, columns, worlds)
+        same_bytes = _same_chunks(spec, entry, at, columns, worlds)
         return SequenceComparison(sequence, EQUAL_BYTES if same_bytes else EQUAL_COLUMNS)
     # the slack lets a difference of one millimetre pass in spite of its rounding; rings follow from the scan alone
     hard = largest > TOLERANCE * (1 + 1e-6) or set(counts) == {"rings"}
@@ -186,14 +187,14 @@ def _compare(
 
 
 def _same_chunks(
-    spec: DatasetSpec, entry: ShardEntry, sequence: int, columns: dict[str, npt.NDArray[Any]],
+    spec: DatasetSpec, entry: ShardEntry, at: int, columns: dict[str, npt.NDArray[Any]],
     worlds: dict[str, npt.NDArray[Any]],
 ) -> bool:  # fmt: skip
     """Return whether the compressed chunks of a sequence are the stored ones, byte for byte."""
-    writer = new_writer(spec, sequence)
-    writer.append(columns, worlds)
+    writer = new_writer(spec, entry.split)
+    writer.append(entry.numbers[at], columns, worlds)
     image = writer.finish().data
-    start = (sequence - entry.sequences[0]) * spec.settings.length
+    start = at * spec.settings.length
     with h5py.File(spec.root / entry.file, "r") as old, h5py.File.in_memory(image) as new:
         for name in spec.columns:
             a, b = old[name].id, new[name].id

@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from pathlib import Path
 
 from tqdm import tqdm
 
@@ -63,7 +64,7 @@ class Run:
             check_storage(self.store)
             self.manifest = new_manifest(request)
         check_manifest(self.request)
-        self._entries = {entry.sequences: entry for entry in self.manifest.shards}
+        self._entries = {(entry.split, entry.sequences): entry for entry in self.manifest.shards}
 
     def _resume(self, explicit_shard_size: bool) -> Manifest:
         try:
@@ -115,14 +116,12 @@ class Run:
 
     def _tasks(self) -> list[ShardTask]:
         """Return the shards still to be made; one that replaces a listed, shorter one is staged."""
-        size, n = self.manifest.shard_size, self.request.n
-        starts = {entry.sequences[0] for entry in self._entries.values()}
-        tasks = []
-        for index in self.request.shards:
-            first, stop = index * size, min((index + 1) * size, n)
-            if (first, stop) not in self._entries:
-                tasks.append(ShardTask(index, first, stop, staged=first in starts))
-        return tasks
+        there = {entry.file for entry in self._entries.values()}
+        return [
+            replace(task, staged=task.file in there)
+            for task in self.request.shards
+            if (task.split, task.sequences) not in self._entries
+        ]
 
     def go(self, make_executor: Callable[[DatasetSpec, int], LocalExecutor | RayExecutor], progress: bool) -> None:
         """Make what is missing and finish the manifest.
@@ -201,23 +200,24 @@ class Run:
 
     def _clean_up(self) -> None:
         """Remove what killed processes left behind: temp files and shards that never left staging."""
-        self.store.clean_up(None if self.request.part is None else self.request.shards)  # others are at work
+        part = self.request.part  # others are at work on theirs
+        self.store.clean_up(None if part is None else {Path(task.file).stem for task in self.request.shards})
         for path in self.home.glob(f".*{PART_SUFFIX}"):
             path.unlink(missing_ok=True)
 
     def _add(self, task: ShardTask, entry: ShardEntry) -> None:
         check_visible(self.store, entry, staged=task.staged)
         if task.staged:
-            self._replace(task, entry)
-        self._entries[task.first, task.stop] = entry
+            self._replace(entry)
+        self._entries[entry.split, entry.sequences] = entry
         self.new_rows += entry.rows
         self._unsaved = True
         if task.staged:
             self._save()
 
-    def _replace(self, task: ShardTask, entry: ShardEntry) -> None:
-        """Put a staged shard in the place of the shorter one that starts at the same sequence."""
-        for key in [k for k in self._entries if k[0] == task.first]:
+    def _replace(self, entry: ShardEntry) -> None:
+        """Put a staged shard in the place of the shorter one."""
+        for key in [k for k, old in self._entries.items() if old.file == entry.file]:
             self.new_rows -= self._entries.pop(key).rows
         self._save()
         for part in (entry.worlds, entry):

@@ -38,7 +38,7 @@ class FolderStore:
         return str(self.root)
 
     def publish(self, index: int, image: ShardImage, *, staged: bool) -> ShardEntry:
-        """Write a shard."""
+        """Write shard `index` of its split."""
         root = self.root / STAGING if staged else self.root
         root.mkdir(exist_ok=True)
         return publish(root, index, image)
@@ -55,13 +55,12 @@ class FolderStore:
         """Move a file from staging to its place."""
         os.replace(self.root / STAGING / file, self.root / file)
 
-    def clean_up(self, shards: Container[int] | None) -> None:
-        """Remove temp files of these shards (None: of all), and what never left staging."""
+    def clean_up(self, shards: Container[str] | None) -> None:
+        """Remove temp files of these shards, such as train-00000 (None: of all), and what never left staging."""
         shutil.rmtree(self.root / STAGING, ignore_errors=True)
         for folder in (self.root / "data", self.root / "worlds"):
             for path in folder.glob(f".*{PART_SUFFIX}"):
-                number = path.name.removeprefix(".shard-").partition(".")[0]
-                if shards is None or (number.isdecimal() and int(number) in shards):
+                if shards is None or path.name.removeprefix(".").partition(".")[0] in shards:
                     path.unlink(missing_ok=True)
 
     def finish(self, root: Path) -> None:
@@ -126,7 +125,7 @@ class UrlStore:
         fs, base = self._place
         fs.mv(f"{base}/{STAGING}/{file}", f"{base}/{file}")
 
-    def clean_up(self, shards: Container[int] | None) -> None:
+    def clean_up(self, shards: Container[str] | None) -> None:
         """Remove shards that never left staging."""
         fs, base = self._place
         if fs.exists(f"{base}/{STAGING}"):

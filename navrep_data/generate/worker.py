@@ -6,15 +6,17 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any
 
+from navrep_data.generate.inputs import check_here
 from navrep_data.generate.policy import PolicySpec, make_rollout
 from navrep_data.generate.storage import Store, store_of
-from navrep_data.shards import ShardEntry, ShardWriter
+from navrep_data.shards import SPLITS, Ranges, ShardEntry, ShardWriter, count_in_split, nth_of_split, ranges_of
+from navrep_data.shards.entries import shard_file
 from navrep_data.sim import CallableRollout, RolloutSettings, ScriptedRollout, SimConfig
 
 
@@ -22,7 +24,8 @@ from navrep_data.sim import CallableRollout, RolloutSettings, ScriptedRollout, S
 class DatasetSpec:
     """Everything that determines the bytes of a dataset's shards, and where they go.
 
-    Shards go to the URL `storage`, or to `root` where there is none.
+    Shards go to the URL `storage`, or to `root` where there is none. `inputs` are hashes of what it is made from, see
+    ``navrep_data/generate/inputs.py``.
     """
 
     root: Path
@@ -32,6 +35,7 @@ class DatasetSpec:
     seed: int
     columns: tuple[str, ...]
     storage: str | None = None
+    inputs: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def store(self) -> Store:
@@ -41,13 +45,56 @@ class DatasetSpec:
 
 @dataclass(frozen=True)
 class ShardTask:
-    """One shard to make: its number, its sequences [first, stop), and the counter to report rows in."""
+    """One shard to make.
 
+    Attributes
+    ----------
+    split : str
+        Its split.
+    index : int
+        Its number among the shards of the split.
+    first, stop : int
+        Its sequences, counted within the split.
+    slot : int
+        The counter to report rows in.
+    staged : bool
+        Whether it is to wait beside its place, where a shorter one is.
+    """
+
+    split: str
     index: int
     first: int
     stop: int
     slot: int = 0
     staged: bool = False
+
+    @property
+    def file(self) -> str:
+        """Its file in the dataset."""
+        return shard_file(self.split, self.index)
+
+    @property
+    def numbers(self) -> list[int]:
+        """The numbers of its sequences in the dataset."""
+        return [nth_of_split(self.split, k) for k in range(self.first, self.stop)]
+
+    @property
+    def sequences(self) -> Ranges:
+        """The same as the manifest lists them."""
+        return ranges_of(self.numbers)
+
+
+def all_shards(n: int, shard_size: int) -> list[ShardTask]:
+    """Return the shards of a dataset of `n` sequences: those of each split, `shard_size` sequences in all but its last.
+
+    Only the last one of each split changes when the dataset grows.
+    """
+    counts = {split: count_in_split(split, n) for split in SPLITS}
+    return [
+        ShardTask(split, index, first, min(first + shard_size, count))
+        for split, count in counts.items()
+        for index, first in enumerate(range(0, count, shard_size))
+    ]
 
 
 # Enough for an estimate to within the machine's own noise, and done before one notices.
@@ -75,6 +122,8 @@ def _exit_with(parent: Any) -> None:
 def run_task(task: ShardTask) -> ShardEntry:
     """Make one shard in a worker process that :func:`start_worker` has prepared."""
     if "rollout" not in _state:
+        spec = _state["spec"]
+        check_here(spec.inputs, spec.config, spec.policy, "in a worker process")
         _state["rollout"] = rollout_of(_state["spec"])
     counters = _state["counters"]
     made = 0
@@ -121,17 +170,17 @@ def make_shard(
     DiskSpaceError
         If there is no room; what is in place stays as it was.
     """
-    writer = new_writer(spec, task.first)
-    for start in range(task.first, task.stop, rollout.batch):
-        group = range(start, min(start + rollout.batch, task.stop))
-        for columns, worlds in rollout.run(group):
-            writer.append(columns, worlds)
+    writer, numbers = new_writer(spec, task.split), task.numbers
+    for start in range(0, len(numbers), rollout.batch):
+        group = numbers[start : start + rollout.batch]
+        for number, (columns, worlds) in zip(group, rollout.run(group), strict=True):
+            writer.append(number, columns, worlds)
             report(spec.settings.length)
     return spec.store.publish(task.index, writer.finish(), staged=task.staged)
 
 
-def new_writer(spec: DatasetSpec, first_sequence: int) -> ShardWriter:
-    """Return the writer of the shard that starts at this sequence."""
+def new_writer(spec: DatasetSpec, split: str) -> ShardWriter:
+    """Return the writer of a shard of this split."""
     return ShardWriter(
         env=spec.config.env,
         config=spec.config.to_dict(),
@@ -141,7 +190,7 @@ def new_writer(spec: DatasetSpec, first_sequence: int) -> ShardWriter:
         columns=spec.columns,
         max_humans=spec.config.max_others,
         length=spec.settings.length,
-        first_sequence=first_sequence,
+        split=split,
     )
 
 
@@ -155,9 +204,9 @@ def seconds_per_row(spec: DatasetSpec) -> float:
     seconds = 0.0
     for sequence in (0, 1):  # the first one compiles
         begun = time.perf_counter()
-        writer = new_writer(short, sequence)
+        writer = new_writer(short, SPLITS[0])
         for columns, worlds in rollout.run([sequence]):
-            writer.append(columns, worlds)
+            writer.append(sequence, columns, worlds)
         writer.finish()
         seconds = time.perf_counter() - begun
     return seconds / short.settings.length

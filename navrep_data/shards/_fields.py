@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 from typing import Any
@@ -64,11 +65,11 @@ class Fields:
             self.bad(name, "a list of texts")
         return tuple(value)
 
-    def pair(self, name: str) -> tuple[int, int]:
+    def ranges(self, name: str) -> tuple[tuple[int, int], ...]:
         value = self.get(name, list)
-        if not is_range(value):
-            self.bad(name, "[first, stop] with first < stop")
-        return value[0], value[1]
+        if not value or not all(map(_is_range, value)) or any(a[1] >= b[0] for a, b in itertools.pairwise(value)):
+            self.bad(name, "ranges [start, stop] with start < stop, ascending, with gaps between them")
+        return tuple((start, stop) for start, stop in value)
 
     def file(self, root: Path) -> FileEntry:
         name: str = self.get("file", str)
@@ -79,7 +80,7 @@ class Fields:
         return FileEntry(name, self.sha256("sha256"), self.count("bytes"))
 
 
-def is_range(value: Any) -> bool:
+def _is_range(value: Any) -> bool:
     return (
         isinstance(value, list)
         and len(value) == 2

@@ -34,6 +34,7 @@ VECTOR_COLUMNS = ("robot_state", "action", "robot_pose", "leading_action", "sour
 BYTES_PER_ROW: dict[str, float] = {
     "scan": 1290.0,
     "rings": 150.0,
+    "scan_label": 60.0,
     "robot_state": 17.1,
     "action": 10.5,
     "reward": 3.0,
@@ -171,6 +172,10 @@ def column_attributes(layout: Layout) -> dict[str, str | float]:
         attributes["names"] = ",".join(EVENT_NAMES)
     elif column.name == "rings":
         attributes["names"] = "free,unknown,occupied"
+    elif column.name == "contact":
+        attributes["names"] = "none,human,robot,static"
+    elif column.name == "scan_label":
+        attributes["names"] = "nothing,static,robot,human of slot 0,..."
     return attributes
 
 

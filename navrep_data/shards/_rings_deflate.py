@@ -6,7 +6,8 @@ before. So there are two kinds of match, distance 1 (a run) and distance 64 (a c
 chunks. The result is an ordinary deflate stream (RFC 1951) of one dynamic block, readable by any HDF5 library.
 
 Why not a library: rings are half of all bytes that are compressed. Measured in one run on rings of soadrl, per row:
-3.2 us against libdeflate's 11, 149 B against 221, and 1.8 us against 2.6 to inflate.
+3.2 us against libdeflate's 11, 149 B against 221, and 1.8 us against 2.6 to inflate. Without it, `generate` of
+soadrl took 10 % longer (median of eight turns of 60 sequences, one core), and its shards 4 % more bytes.
 
 Cells are looked at eight at a time, as words: where two words differ, zero bits tell the first and the last cell.
 """

@@ -40,6 +40,20 @@ def count_cells(cells):
 
 
 @kernel
+def count_bytes(values):
+    """Return how often each of the 256 values is in values (n,) uint8, n > 0: (256,) int64."""
+    counts = np.zeros(256, np.int64)
+    present, run = values[0], 0
+    for k in range(values.shape[0]):  # most follow an equal one
+        if values[k] != present:
+            counts[present] += run
+            present, run = values[k], 0
+        run += 1
+    counts[present] += run
+    return counts
+
+
+@kernel
 def byte_entropy(sample):
     """Return the entropy of sample (n,) uint8, n > 0 [bit per byte]."""
     counts = np.zeros(256, np.int64)

@@ -7,11 +7,8 @@ from typing import Any
 
 from navrep_data.schema import COLUMNS
 from navrep_data.shards._layout import VECTOR_COLUMNS, Layout, layouts
-from navrep_data.shards.entries import SPLITS
+from navrep_data.shards.entries import SPLITS, count_of, shard_file
 from navrep_data.shards.manifest import Manifest
-
-# Beyond this many files one pattern names them all, in one split.
-_MAX_LISTED = 1000
 
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 _SIZES_LARGE = ((10_000_000, "1M<n<10M"), (100_000_000, "10M<n<100M"), (1_000_000_000, "100M<n<1B"))
@@ -51,25 +48,10 @@ def _size_category(rows: int) -> str:
 
 
 def _data_files(m: Manifest) -> list[str]:
-    """Return the shards by split where each belongs to one; else all of them as one split."""
-    by_split: dict[str, list[str]] = {name: [] for name in SPLITS}
-    for shard in m.shards:
-        held = {m.split_of(k) for k in range(*shard.sequences)}
-        if len(held) != 1 or None in held or len(m.shards) > _MAX_LISTED:
-            return ["  - split: train", '    path: "data/*.h5"']
-        by_split[str(held.pop())].append(shard.file)
-    lines = []
-    for name, files in by_split.items():
-        if files:
-            lines += [f"  - split: {name}", "    path:", *(f'    - "{file}"' for file in files)]
-    return lines
-
-
-def split_note(m: Manifest) -> str:
-    """Say what the Hub's viewer, which knows files only, shows of the splits."""
-    if len(_data_files(m)) == 2:
-        return "Shards hold sequences of several splits, so the Hub's viewer shows all of them as one."
-    return "Each shard belongs to one split, and the Hub's viewer shows them so."
+    """Return the files of each split that has any."""
+    there = {shard.split for shard in m.shards}
+    lines = [(f"  - split: {name}", f'    path: "data/{name}-*.h5"') for name in SPLITS if name in there]
+    return [line for pair in lines for line in pair]
 
 
 def _configs(m: Manifest) -> list[dict[str, Any]]:
@@ -296,7 +278,8 @@ def dataset_card(manifest: Manifest) -> str:
         if humans.get("count")
         else ""
     )
-    splits = [(n, f"{sum(b - a for a, b in m.splits.get(n, ())):,}") for n in SPLITS]
+    splits = [(name, f"{count_of(ranges):,}") for name, ranges in m.splits.items()]
+    example = m.shards[0].file if m.shards else shard_file(SPLITS[0], 0)
     scene = "map" if m.config.get("world") == "map" else "obstacles"
     worlds = (
         f"`worlds/` holds the {scene}, goals and start states of each episode, one npz per shard.\n\n"
@@ -341,8 +324,7 @@ anticlockwise; up to {m.sensor.range_max:g} m; one step is {m.sensor.dt:g} s.
 
 ## Splits
 
-By sequence ({m.split_rule}); ranges are in `manifest.json`.
-{split_note(m)}
+By sequence ({m.split_rule}); each file belongs to one split.
 
 {_table(("split", "sequences"), splits)}
 
@@ -365,7 +347,7 @@ Without navrep-data, any HDF5 reader works:
 ```python
 import h5py
 
-with h5py.File("data/shard-00000.h5") as shard:
+with h5py.File("{example}") as shard:
     scans_in_metres = shard["scan"][:32] * shard["scan"].attrs["scale"]
     actions = shard["action"][:32]
 ```

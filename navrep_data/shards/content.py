@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from navrep_data.errors import ConfigError, did_you_mean
 from navrep_data.io import json_bytes, sha256_bytes
-from navrep_data.shards.entries import SPLITS, Ranges
+from navrep_data.shards.entries import SPLITS
 from navrep_data.shards.manifest import Manifest
 from navrep_data.shards.statistics import merge_statistics
 
@@ -26,11 +26,11 @@ def content_hash(manifest: Manifest) -> str:
     not depend on how rows are grouped into shards or compressed, on licence, card or pictures; a part of a dataset has
     another one than the whole.
     """
-    sequences = [
+    sequences = sorted(
         [sequence, digest]
         for shard in manifest.shards
-        for sequence, digest in zip(range(*shard.sequences), shard.sequence_hashes, strict=True)
-    ]
+        for sequence, digest in zip(shard.numbers, shard.sequence_hashes, strict=True)
+    )
     values = {
         "columns": list(manifest.columns),
         "scan_dtype": manifest.scan_dtype,
@@ -48,7 +48,7 @@ def choose_shards(manifest: Manifest, *, split: str | None = None, shards: Itera
     manifest : Manifest
         Of the whole.
     split : str, optional
-        Only shards that hold at least one sequence of this split.
+        Only shards of this split.
     shards : iterable of int, optional
         Only these positions.
 
@@ -67,8 +67,7 @@ def choose_shards(manifest: Manifest, *, split: str | None = None, shards: Itera
     if split is not None:
         if split not in SPLITS:
             raise ConfigError(f"Unknown split {split!r}; expected {', '.join(SPLITS)}.{did_you_mean(split, SPLITS)}")
-        ranges = manifest.splits.get(split, ())
-        chosen = {k for k in chosen if _overlap(ranges, *manifest.shards[k].sequences)}
+        chosen = {k for k in chosen if manifest.shards[k].split == split}
     if not chosen:
         raise ConfigError("No shard is left to get: choose other --shards, or another --split.")
     return sorted(chosen)
@@ -86,8 +85,7 @@ def select_shards(manifest: Manifest, chosen: Sequence[int]) -> Manifest:
 
     Notes
     -----
-    The part keeps the numbers of its sequences, and its splits hold what is left of each; its statistics are those of
-    its own shards.
+    The part keeps the numbers and splits of its sequences; its statistics are those of its own shards.
     """
     if list(chosen) == list(range(len(manifest.shards))):
         return manifest
@@ -97,7 +95,6 @@ def select_shards(manifest: Manifest, chosen: Sequence[int]) -> Manifest:
         shards=kept,
         complete=False,
         statistics=merge_statistics(shard.statistics for shard in kept),
-        splits={name: _within(ranges, [shard.sequences for shard in kept]) for name, ranges in manifest.splits.items()},
         partial={
             "manifest_sha256": manifest.to_dict()["manifest_sha256"],
             "shards": len(manifest.shards),
@@ -106,13 +103,3 @@ def select_shards(manifest: Manifest, chosen: Sequence[int]) -> Manifest:
         },
         card_sha256=None,
     )
-
-
-def _overlap(ranges: Ranges, first: int, stop: int) -> bool:
-    return any(a < stop and first < b for a, b in ranges)
-
-
-def _within(ranges: Ranges, parts: Sequence[tuple[int, int]]) -> Ranges:
-    """Return what the ranges have in common with the parts, both ascending."""
-    found = ((max(a, first), min(b, stop)) for first, stop in parts for a, b in sorted(ranges))
-    return tuple((a, b) for a, b in found if a < b)

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import itertools
+import re
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+from navrep_data.errors import SchemaVersionError
+from navrep_data.schema import FORMAT_VERSION, OLDEST_FORMAT
 
 if TYPE_CHECKING:
     from navrep_data.shards.source import SequenceSource
@@ -12,17 +18,28 @@ if TYPE_CHECKING:
 SPLITS = ("train", "val", "test")
 SPLIT_RULE = "sequence % 10 == 1: val; sequence % 10 == 2: test; all others: train"
 
+# Of each ten sequences that follow each other, those of each split.
+_PERIOD = 10
+_MEMBERS = {"train": (0, 3, 4, 5, 6, 7, 8, 9), "val": (1,), "test": (2,)}
+_SPLIT_OF = {k: name for name, members in _MEMBERS.items() for k in members}
+
 Ranges = tuple[tuple[int, int], ...]
 
+INDEX_FILE = "index.json"
+_SHARD = r"(?:train|val|test)-[0-9]{5,10}"
+# Names that the format gives to files, apart from those of which a folder has one.
+EXTRA_NAME = re.compile(rf"media/[A-Za-z0-9][\w.-]{{0,99}}\.(?:png|gif)|{re.escape(INDEX_FILE)}")
+FILE_NAME = re.compile(rf"data/{_SHARD}\.h5|worlds/{_SHARD}\.npz|{EXTRA_NAME.pattern}")
 
-def shard_file(index: int) -> str:
-    """Return the name of shard `index` inside the dataset folder."""
-    return f"data/shard-{index:05d}.h5"
+
+def shard_file(split: str, index: int) -> str:
+    """Return the name of shard `index` of a split inside the dataset folder."""
+    return f"data/{split}-{index:05d}.h5"
 
 
-def worlds_file(index: int) -> str:
-    """Return the name of the worlds file of shard `index` inside the dataset folder."""
-    return f"worlds/shard-{index:05d}.npz"
+def worlds_file(split: str, index: int) -> str:
+    """Return the name of the worlds file of shard `index` of a split inside the dataset folder."""
+    return f"worlds/{split}-{index:05d}.npz"
 
 
 @dataclass(frozen=True)
@@ -54,8 +71,10 @@ class ShardEntry:
         As in :class:`FileEntry`.
     rows : int
         Number of rows.
-    sequences : tuple of int
-        First sequence, and the one after the last.
+    split : str
+        The split that all its sequences belong to.
+    sequences : tuple of (start, stop)
+        Numbers of its sequences, ascending, as ranges [start, stop).
     worlds : FileEntry or None
         The worlds file beside it.
     statistics : dict
@@ -70,16 +89,63 @@ class ShardEntry:
     sha256: str
     bytes: int
     rows: int
-    sequences: tuple[int, int]
+    split: str
+    sequences: Ranges
     worlds: FileEntry | None
     statistics: dict[str, Any] = field(repr=False)
     sequence_hashes: tuple[str, ...] = field(repr=False)
     source: tuple[SequenceSource, ...] = field(default=(), repr=False)
 
+    @property
+    def order(self) -> tuple[int, int]:
+        """Where it comes in a dataset: by split, then by its first sequence."""
+        return SPLITS.index(self.split), self.sequences[0][0]
+
+    @property
+    def count(self) -> int:
+        """Number of its sequences."""
+        return count_of(self.sequences)
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Numbers of its sequences, ascending."""
+        return tuple(numbers_of(self.sequences))
+
+    def position(self, sequence: int) -> int | None:
+        """Return how many of its sequences come before `sequence`, None where it is not one of them."""
+        before = 0
+        for start, stop in self.sequences:
+            if start <= sequence < stop:
+                return before + sequence - start
+            before += stop - start
+        return None
+
 
 def split_of(sequence: int) -> str:
     """Return the split of a sequence by the default rule (:data:`SPLIT_RULE`)."""
-    return {1: "val", 2: "test"}.get(sequence % 10, "train")
+    return _SPLIT_OF[sequence % _PERIOD]
+
+
+def count_in_split(split: str, n: int) -> int:
+    """Return how many of the sequences 0 to n - 1 are in a split by the default rule."""
+    whole, rest = divmod(n, _PERIOD)
+    return whole * len(_MEMBERS[split]) + bisect_left(_MEMBERS[split], rest)
+
+
+def nth_of_split(split: str, k: int) -> int:
+    """Return the number of the k-th sequence (from 0) of a split by the default rule."""
+    period, at = divmod(k, len(_MEMBERS[split]))
+    return period * _PERIOD + _MEMBERS[split][at]
+
+
+def count_of(ranges: Ranges) -> int:
+    """Return how many numbers are in [start, stop) ranges."""
+    return sum(stop - start for start, stop in ranges)
+
+
+def numbers_of(ranges: Ranges) -> Iterator[int]:
+    """Yield the numbers in [start, stop) ranges."""
+    return itertools.chain.from_iterable(range(start, stop) for start, stop in ranges)
 
 
 def ranges_of(sequences: Iterable[int]) -> Ranges:
@@ -93,22 +159,21 @@ def ranges_of(sequences: Iterable[int]) -> Ranges:
     return tuple(result)
 
 
-def default_splits(n: int) -> dict[str, Ranges]:
-    """Return the default split of sequences 0 to n - 1.
+def check_version(where: str, version: float) -> None:
+    """Refuse what is of another format version than this package reads.
 
-    Parameters
-    ----------
-    n : int
-        Number of sequences.
-
-    Returns
-    -------
-    dict of str to tuple of (start, stop)
-        Ranges of sequence indices for train (80 %), val (10 %) and test (10 %).
-
-    Notes
-    -----
-    Three sequences already have all three splits, and extending a dataset never moves a sequence to another
-    one.
+    Raises
+    ------
+    SchemaVersionError
+        Saying what to do.
     """
-    return {name: ranges_of(k for k in range(n) if split_of(k) == name) for name in SPLITS}
+    if version > FORMAT_VERSION:
+        raise SchemaVersionError(
+            f"{where} has format version {version:g}; this package reads versions {OLDEST_FORMAT} to {FORMAT_VERSION}. "
+            "Upgrade it: pip install -U navrep-data"
+        )
+    if version < OLDEST_FORMAT:
+        raise SchemaVersionError(
+            f"{where} has format version {version:g}, which was never released; expected {OLDEST_FORMAT} or newer: "
+            "generate or import it again into a new folder."
+        )

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from navrep_data.errors import ConfigError, CorruptDataError, did_you_mean
 from navrep_data.io import safe_join
 from navrep_data.shards.content import content_hash
-from navrep_data.shards.entries import SPLITS, ShardEntry
+from navrep_data.shards.entries import SPLITS, ShardEntry, count_of
 from navrep_data.shards.manifest import Manifest
 from navrep_data.shards.origin import Origin, read_origin
 from navrep_data.shards.reader import Shard
@@ -34,7 +34,7 @@ ShardIndex = tuple[Ints, Ints, Ints, npt.NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class Episodes:
-    """Every episode of a dataset, in order: arrays of equal length.
+    """Every episode of a dataset, in the order of their sequences: arrays of equal length.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Episodes:
     event : ndarray of shape (E,), uint8
         Why it ended.
     split : ndarray of shape (E,), int8
-        Position in :data:`SPLITS`, -1 where in none.
+        Position in :data:`SPLITS`.
     """
 
     sequence: Ints
@@ -226,13 +226,9 @@ def join_index(manifest: Manifest, parts: Sequence[ShardIndex]) -> Episodes:
         [np.diff(np.append(part[2], entry.rows)) for part, entry in zip(parts, manifest.shards, strict=True)]
     )
     sequence, episode, start, event = (np.concatenate(column) for column in zip(*parts, strict=True))
-    split = np.full(len(sequence), -1, np.int8)
-    for code, name in enumerate(SPLITS):
-        ranges = np.array(sorted(manifest.splits.get(name, ())), np.int64).reshape(-1, 2)
-        if len(ranges):
-            at = np.searchsorted(ranges[:, 0], sequence, side="right") - 1
-            split[(at >= 0) & (sequence < ranges[np.maximum(at, 0), 1])] = code
-    return Episodes(sequence, episode, where, start, length, event, split)
+    split = np.array([SPLITS.index(entry.split) for entry in manifest.shards], np.int8)[where]
+    order = np.argsort(sequence, kind="stable")
+    return Episodes(*(column[order] for column in (sequence, episode, where, start, length, event, split)))
 
 
 def dataset_record(dataset: DatasetFolder | Path | str) -> dict[str, Any]:
@@ -296,7 +292,7 @@ def info(root: Path | str) -> dict[str, Any]:
         "bytes_per_row": round(m.bytes / m.rows, 1) if m.rows else None,
         "scan_dtype": m.scan_dtype,
         "columns": list(m.columns),
-        "splits": {name: sum(b - a for a, b in ranges) for name, ranges in m.splits.items()},
+        "splits": {name: count_of(ranges) for name, ranges in m.splits.items()},
         "outcomes": m.statistics.get("outcomes", {}),
         "policy": m.policy,
         "versions": m.versions,

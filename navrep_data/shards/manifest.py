@@ -14,12 +14,25 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, SchemaVersionError
+from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError
 from navrep_data.io import atomic_write_bytes, json_bytes, read_json
 from navrep_data.schema import FORMAT_NAME, FORMAT_VERSION, SensorContract
-from navrep_data.shards._fields import SHA256, Fields, is_range
+from navrep_data.shards._fields import SHA256, Fields
 from navrep_data.shards._layout import SCAN_DTYPES, column_order
-from navrep_data.shards.entries import SPLIT_RULE, SPLITS, FileEntry, Ranges, ShardEntry, default_splits
+from navrep_data.shards.entries import (
+    EXTRA_NAME,
+    FILE_NAME,
+    INDEX_FILE,
+    SPLIT_RULE,
+    SPLITS,
+    FileEntry,
+    Ranges,
+    ShardEntry,
+    check_version,
+    count_of,
+    numbers_of,
+    split_of,
+)
 from navrep_data.shards.source import parse_datasets, parse_sources
 from navrep_data.shards.statistics import check_statistics, merge_statistics
 
@@ -27,6 +40,7 @@ MANIFEST_FILE = "manifest.json"
 CARD_FILE = "README.md"
 PARTIAL_FIELDS = ("manifest_sha256", "shards", "sequences", "rows")
 """What the manifest of a copy with some of the shards says of the whole: its hash, and how much it has."""
+_HASH = re.compile(r"[0-9a-f]{32,64}")
 _LICENSE = re.compile(r"[a-z0-9][a-z0-9.+-]{0,63}")
 
 
@@ -56,12 +70,16 @@ class Manifest:
         What a scan means.
     config, policy, versions : dict
         Whole configuration, the policy that drove, and versions of what computed it: JSON values.
+    inputs : dict of str to str
+        SHA-256 of what it was made from beside its settings: ``map:NAME`` of each map's content, ``policy`` of a Python
+        policy's file or weights.
+    origins : dict of str to (float, float)
+        Where coordinates begin: (x, y) [m] in the frame of a map's file (``map:NAME``), or in that of a recording's
+        odometry (``recording``); what is not listed begins at (0, 0) there.
     shards : tuple of ShardEntry
-        In order of their sequences; gaps only while not complete.
-    splits : dict of str to ranges
-        Ranges [start, stop) of sequence indices by split.
+        By split, in order of their sequences; gaps only while not complete.
     split_rule : str
-        The rule behind `splits`, in words.
+        The rule by which sequences got their split, in words.
     complete : bool
         Whether all planned sequences are there.
     statistics : dict
@@ -95,8 +113,9 @@ class Manifest:
     config: dict[str, Any] = field(repr=False)
     policy: dict[str, Any] = field(repr=False)
     versions: dict[str, Any] = field(repr=False)
+    inputs: dict[str, str] = field(default_factory=dict, repr=False)
+    origins: dict[str, tuple[float, float]] = field(default_factory=dict, repr=False)
     shards: tuple[ShardEntry, ...] = field(default=(), repr=False)
-    splits: dict[str, Ranges] = field(default_factory=dict, repr=False)
     split_rule: str = SPLIT_RULE
     complete: bool = False
     statistics: dict[str, Any] = field(default_factory=dict, repr=False)
@@ -116,17 +135,20 @@ class Manifest:
     @property
     def sequences(self) -> int:
         """Sequences in the listed shards."""
-        return sum(shard.sequences[1] - shard.sequences[0] for shard in self.shards)
+        return sum(shard.count for shard in self.shards)
+
+    @property
+    def splits(self) -> dict[str, Ranges]:
+        """Numbers of the sequences of each split, as ranges [start, stop)."""
+        return {name: tuple(r for s in self.shards if s.split == name for r in s.sequences) for name in SPLITS}
 
     @property
     def bytes(self) -> int:
         """Bytes of the listed shards and their worlds."""
         return sum(s.bytes + (s.worlds.bytes if s.worlds else 0) for s in self.shards)
 
-    def with_shards(
-        self, shards: Iterable[ShardEntry], *, complete: bool, splits: Mapping[str, Ranges] | None = None
-    ) -> Manifest:
-        """Return a manifest that lists `shards`, with statistics merged in their order and splits to match.
+    def with_shards(self, shards: Iterable[ShardEntry], *, complete: bool) -> Manifest:
+        """Return a manifest that lists `shards`, with statistics merged in their order.
 
         Parameters
         ----------
@@ -134,31 +156,32 @@ class Manifest:
             In any order.
         complete : bool
             Whether these are all planned sequences.
-        splits : mapping, optional
-            Other splits than the default rule's (set `split_rule` too).
         """
-        ordered = tuple(sorted(shards, key=lambda shard: shard.sequences))
-        stop = ordered[-1].sequences[1] if ordered else 0
+        ordered = tuple(sorted(shards, key=lambda shard: shard.order))
         manifest = replace(
             self,
             shards=ordered,
             complete=complete,
             statistics=merge_statistics(shard.statistics for shard in ordered),
-            splits=dict(splits) if splits is not None else default_splits(stop),
             card_sha256=None,
             extras=(),  # they were made from other shards
             partial=None,
         )
-        problem = _check_shards(manifest) or _check_splits(manifest)
+        problem = _check_shards(manifest)
         if problem:
             raise ConfigError(f"These shards are not a dataset: {problem}.")
         return manifest
 
     def split_of(self, sequence: int) -> str | None:
         """Return the name of the split that holds `sequence`, or None."""
-        for name, ranges in self.splits.items():
-            if any(start <= sequence < stop for start, stop in ranges):
-                return name
+        return next((s.split for s in self.shards if s.position(sequence) is not None), None)
+
+    def place_of(self, sequence: int) -> tuple[int, int] | None:
+        """Return the position of the shard that holds `sequence`, and its position there; None if it is not here."""
+        for k, shard in enumerate(self.shards):
+            at = shard.position(sequence)
+            if at is not None:
+                return k, at
         return None
 
     def to_dict(self) -> dict[str, Any]:
@@ -181,11 +204,12 @@ class Manifest:
             "sensor": self.sensor.to_dict(),
             "config": self.config,
             "policy": self.policy,
+            "inputs": self.inputs,
+            "origins": {name: list(place) for name, place in self.origins.items()},
             "versions": self.versions,
             "command": self.command,
             "statistics": self.statistics,
             "split_rule": self.split_rule,
-            "splits": {name: [list(r) for r in ranges] for name, ranges in self.splits.items()},
             "shards": [_entry_dict(shard) for shard in self.shards],
         }
         # absent where they do not apply, so that what generate writes has never heard of them
@@ -243,17 +267,13 @@ class Manifest:
         if fields.get("format", str) != FORMAT_NAME:
             fields.bad("format", f"{FORMAT_NAME!r}")
         version = fields.count("format_version")
-        if version > FORMAT_VERSION or version < 1:
-            raise SchemaVersionError(
-                f"{root} has format version {version}; this package reads versions 1 to {FORMAT_VERSION}. "
-                "Upgrade it: pip install -U navrep-data"
-            )
+        check_version(str(root), version)
         try:
             manifest = _parse(fields, root)
             digest = _hash(values)
         except RecursionError:
             raise CorruptDataError(f"{root / MANIFEST_FILE} is nested too deeply; get it again.") from None
-        problem = _check_shards(manifest) or _check_splits(manifest)
+        problem = _check_shards(manifest)
         if not problem and (manifest.rows, manifest.sequences) != (
             fields.count("rows"),
             fields.count("sequences"),
@@ -299,7 +319,7 @@ def _hash(values: Mapping[str, Any]) -> str:
 
 def _entry_dict(shard: ShardEntry) -> dict[str, Any]:
     values = asdict(shard)
-    values["sequences"] = list(shard.sequences)
+    values["sequences"] = [list(r) for r in shard.sequences]
     values["sequence_hashes"] = list(shard.sequence_hashes)
     if shard.source:
         values["source"] = [list(one) for one in shard.source]
@@ -340,10 +360,11 @@ def _parse(fields: Fields, root: Path) -> Manifest:
         config=fields.get("config", dict),
         policy=fields.get("policy", dict),
         versions=fields.get("versions", dict),
+        inputs=_parse_inputs(fields),
+        origins=_parse_origins(fields),
         shards=tuple(
             _parse_shard(fields, k, root, columns, len(source)) for k in range(len(fields.get("shards", list)))
         ),
-        splits=_parse_splits(fields),
         split_rule=fields.get("split_rule", str),
         complete=fields.get("complete", bool),
         statistics=_parse_statistics(fields, columns),
@@ -353,6 +374,21 @@ def _parse(fields: Fields, root: Path) -> Manifest:
         source=source,
         format_version=fields.count("format_version"),
     )
+
+
+def _parse_inputs(fields: Fields) -> dict[str, str]:
+    values: dict[str, str] = fields.get("inputs", dict)
+    if not all(isinstance(digest, str) and _HASH.fullmatch(digest) for digest in values.values()):
+        fields.bad("inputs", "hashes of 32 to 64 hex digits by name")
+    return values
+
+
+def _parse_origins(fields: Fields) -> dict[str, tuple[float, float]]:
+    values = fields.get("origins", dict)
+    for place in values.values():
+        if not (isinstance(place, list) and len(place) == 2 and all(type(v) in (int, float) for v in place)):
+            fields.bad("origins", "x and y by name")
+    return {name: (float(x), float(y)) for name, (x, y) in values.items()}
 
 
 def _parse_publication(fields: Fields, root: Path) -> dict[str, Any]:
@@ -367,9 +403,16 @@ def _parse_publication(fields: Fields, root: Path) -> dict[str, Any]:
         partial |= {name: whole.count(name) for name in PARTIAL_FIELDS[1:]}
     return {
         "license": license,
-        "extras": tuple(Fields(v, fields.path, f"extras[{k}].").file(root) for k, v in enumerate(extras)),
+        "extras": tuple(_parse_extra(Fields(v, fields.path, f"extras[{k}]."), root) for k, v in enumerate(extras)),
         "partial": partial,
     }
+
+
+def _parse_extra(fields: Fields, root: Path) -> FileEntry:
+    entry = fields.file(root)
+    if not EXTRA_NAME.fullmatch(entry.file):
+        fields.bad("file", f"{INDEX_FILE}, or a .png or .gif in media")
+    return entry
 
 
 def check_license(license: Any) -> str:
@@ -397,66 +440,65 @@ def _parse_statistics(fields: Fields, columns: Sequence[str]) -> dict[str, Any]:
     return values
 
 
-def _parse_splits(fields: Fields) -> dict[str, Ranges]:
-    values = fields.get("splits", dict)
-    for ranges in values.values():
-        if not isinstance(ranges, list) or not all(is_range(r) for r in ranges):
-            fields.bad("splits", "lists of [start, stop] by split")
-    return {str(name): tuple((r[0], r[1]) for r in ranges) for name, ranges in values.items()}
-
-
 def _parse_shard(parent: Fields, index: int, root: Path, columns: Sequence[str], datasets: int) -> ShardEntry:
     prefix = f"shards[{index}]."
     fields = Fields(parent.values["shards"][index], parent.path, prefix)
     file = fields.file(root)
-    worlds = fields.values.get("worlds")
-    first, stop = fields.pair("sequences")
+    split = fields.get("split", str)
+    if split not in SPLITS:
+        fields.bad("split", " or ".join(SPLITS))
+    if not (file.file.startswith(f"data/{split}-") and FILE_NAME.fullmatch(file.file)):
+        fields.bad("file", f"data/{split}-, a number and .h5, as files of split {split} are called")
+    worlds = None
+    if fields.values.get("worlds") is not None:
+        beside = Fields(fields.values["worlds"], parent.path, prefix + "worlds.")
+        worlds = beside.file(root)
+        expected = f"worlds/{Path(file.file).stem}.npz"
+        if worlds.file != expected:
+            beside.bad("file", f"{expected}, beside {file.file}")
+    sequences = fields.ranges("sequences")
+    count = count_of(sequences)
     hashes = fields.strings("sequence_hashes")
-    if len(hashes) != stop - first or not all(SHA256.fullmatch(h) for h in hashes):
-        fields.bad("sequence_hashes", f"{stop - first} hashes of 64 hex digits")
+    if len(hashes) != count or not all(SHA256.fullmatch(h) for h in hashes):
+        fields.bad("sequence_hashes", f"{count} hashes of 64 hex digits")
     return ShardEntry(
         file=file.file,
         sha256=file.sha256,
         bytes=file.bytes,
         rows=fields.count("rows"),
-        sequences=(first, stop),
-        worlds=None if worlds is None else Fields(worlds, parent.path, prefix + "worlds.").file(root),
+        split=split,
+        sequences=sequences,
+        worlds=worlds,
         statistics=_parse_statistics(fields, columns),
         sequence_hashes=hashes,
-        source=parse_sources(fields, datasets, stop - first),
+        source=parse_sources(fields, datasets, count),
     )
 
 
 def _check_shards(manifest: Manifest) -> str:
     """Return what is wrong with the list of shards, or an empty string."""
-    stop = 0
+    if list(manifest.shards) != sorted(manifest.shards, key=lambda shard: shard.order):
+        return "its shards are not in the order of their splits and sequences"
     for shard in manifest.shards:
-        if shard.sequences[0] < stop:
-            return f"{shard.file} starts at sequence {shard.sequences[0]}, which another shard holds"
-        if manifest.complete and shard.sequences[0] != stop:
-            return f"sequences {stop} to {shard.sequences[0] - 1} are missing in a complete dataset"
-        count = shard.sequences[1] - shard.sequences[0]
-        if not count <= shard.rows <= count * manifest.length:
-            return f"{shard.file} has {shard.rows} rows for {count} sequences of at most {manifest.length}"
-        stop = shard.sequences[1]
+        if not shard.count <= shard.rows <= shard.count * manifest.length:
+            return f"{shard.file} has {shard.rows} rows for {shard.count} sequences of at most {manifest.length}"
+        if manifest.split_rule == SPLIT_RULE:
+            odd = next((k for k in numbers_of(shard.sequences) if split_of(k) != shard.split), None)
+            if odd is not None:
+                return f"{shard.file} of split {shard.split} holds sequence {odd}, which is of split {split_of(odd)}"
+    held = sorted((start, stop, shard.file) for shard in manifest.shards for start, stop in shard.sequences)
+    for one, other in itertools.pairwise(held):
+        if other[0] < one[1]:
+            return f"{other[2]} holds sequence {other[0]}, which {one[2]} holds too"
     files = [s.file for s in manifest.shards] + [s.worlds.file for s in manifest.shards if s.worlds]
     files += [CARD_FILE, MANIFEST_FILE, *(entry.file for entry in manifest.extras)]
     if len(set(files)) != len(files):
         return "a file is listed twice"
-    if manifest.complete and manifest.partial is not None:
+    if not manifest.complete:
+        return ""
+    if manifest.partial is not None:
         return "it is marked both complete and partial"
-    if manifest.complete and stop != manifest.planned:
-        return f"it is marked complete with {stop} of {manifest.planned} sequences"
-    return ""
-
-
-def _check_splits(manifest: Manifest) -> str:
-    ranges = sorted(r for part in manifest.splits.values() for r in part)
-    if any(a[1] > b[0] for a, b in itertools.pairwise(ranges)):
-        return "a sequence is in two splits"
-    if not set(manifest.splits) <= set(SPLITS):
-        return f"splits are named {sorted(manifest.splits)}, expected {', '.join(SPLITS)}"
-    stop = manifest.shards[-1].sequences[1] if manifest.shards else 0
-    if ranges and ranges[-1][1] > stop:
-        return f"a split holds sequence {ranges[-1][1] - 1}, but the last one is {stop - 1}"
+    for stop, (start, _, _) in zip([0, *(h[1] for h in held)], [*held, (manifest.planned, 0, "")], strict=True):
+        if start != stop:
+            return f"it is marked complete, but does not hold the sequences {stop} to {start - 1}"
     return ""

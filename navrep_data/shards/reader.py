@@ -24,7 +24,7 @@ from navrep_data.schema import COLUMNS, FORMAT_NAME, FORMAT_VERSION, SensorContr
 from navrep_data.shards._attributes import read_attribute
 from navrep_data.shards._codec import inflate, unshuffle
 from navrep_data.shards._layout import Layout, layouts
-from navrep_data.shards.entries import ShardEntry
+from navrep_data.shards.entries import ShardEntry, check_version
 
 _DEFLATE, _SHUFFLE, _FLETCHER = 1, 2, 3
 _FLETCHER_BYTES = 4
@@ -75,14 +75,16 @@ class Shard:
     path : path-like
         The HDF5 file.
     expected : ShardEntry, optional
-        What the manifest says: rows and sequence range must be these.
+        What the manifest says: rows, split and number of sequences must be these.
 
     Attributes
     ----------
     rows : int
         Number of rows.
-    sequences : tuple of int
-        First sequence, and the one after the last.
+    split : str
+        The split that it belongs to.
+    first_sequence, sequences : int
+        Number of its first sequence in the dataset, and how many it has.
     env : str
         Environment that made it.
     sensor : SensorContract
@@ -125,14 +127,19 @@ class Shard:
         except Exception as error:  # a damaged file makes the HDF5 library raise nearly anything
             raise_refusal(error, self.path)
             raise self._corrupt(f"is not readable as HDF5 ({_first_line(error)})") from error
-        if expected is not None and (self.rows, self.sequences) != (expected.rows, tuple(expected.sequences)):
+        if expected is None:
+            return
+        if self.split != expected.split:
+            raise self._corrupt(f"belongs to split {self.split!r}, the manifest says {expected.split!r}")
+        wanted = expected.rows, expected.count, expected.sequences[0][0]
+        if (self.rows, self.sequences, self.first_sequence) != wanted:
             raise self._corrupt(
-                f"has {self.rows} rows of sequences {self.sequences}, "
-                f"the manifest says {expected.rows} of {tuple(expected.sequences)}"
+                f"has {self.rows} rows of {self.sequences} sequences from {self.first_sequence} on, "
+                f"the manifest says {wanted[0]} of {wanted[1]} from {wanted[2]} on"
             )
 
     def __repr__(self) -> str:
-        return f"Shard({str(self.path)!r}, rows={self.rows}, sequences={self.sequences})"
+        return f"Shard({str(self.path)!r}, rows={self.rows}, split={self.split!r}, sequences={self.sequences})"
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_fd": None, "_lock": None, "_last": {}, "_narrow": {}}
@@ -232,19 +239,13 @@ class Shard:
         """Check the open file and remember where its chunks are."""
         if self._attribute(file, "format") != FORMAT_NAME:
             raise self._corrupt(f"is HDF5, but its attribute 'format' is not {FORMAT_NAME!r}")
-        version = self._number(file, "format_version")
-        if version > FORMAT_VERSION:
-            raise SchemaVersionError(
-                f"{self.path} has format version {version:g}; "
-                f"this package reads versions 1 to {FORMAT_VERSION}. Upgrade it: pip install -U navrep-data"
-            )
+        check_version(str(self.path), self._number(file, "format_version"))
         self.env = str(self._attribute(file, "env") or "")
         self.rows = int(self._number(file, "rows"))
         self.length = int(self._number(file, "length"))
-        first_stop = self._attribute(file, "sequences")
-        if not isinstance(first_stop, np.ndarray) or first_stop.shape != (2,) or first_stop.dtype.kind != "i":
-            raise self._corrupt("has no attribute 'sequences' of two whole numbers")
-        self.sequences = (int(first_stop[0]), int(first_stop[1]))
+        self.split = str(self._attribute(file, "split") or "")
+        self.first_sequence = int(self._number(file, "first_sequence"))
+        self.sequences = int(self._number(file, "sequences"))
         numbers = {name: self._number(file, name) for name in SensorContract().to_dict()}
         self.sensor = SensorContract(n_rays=int(numbers.pop("n_rays")), **numbers)
         if file.userblock_size:  # moves all offsets

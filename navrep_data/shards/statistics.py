@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from navrep_data.schema import COLUMNS, EVENT_NAMES, SCAN_SCALE
 from navrep_data.shards._layout import VECTOR_COLUMNS
-from navrep_data.shards._sums import count_cells, sum_rays
+from navrep_data.shards._sums import count_bytes, count_cells, sum_rays
 
 # 512 KiB of float64 stay in the cache.
 _BLOCK_ITEMS = 65536
@@ -124,6 +124,14 @@ def _rings_moments(rings: npt.NDArray[Any]) -> Moments:
     return _whole_moments((rings.size, ones + 2 * twos, ones + 4 * twos, low, 2 if twos else min(ones, 1)))
 
 
+def _label_moments(labels: npt.NDArray[Any]) -> Moments:
+    """Return the moments of labels of 8 bits from their counts."""
+    counts = count_bytes(np.ascontiguousarray(labels).reshape(-1))
+    values, there = np.arange(len(counts)), np.flatnonzero(counts)
+    squares = int((counts * values * values).sum())
+    return _whole_moments((labels.size, int((counts * values).sum()), squares, int(there[0]), int(there[-1])))
+
+
 def _whole_moments(sums: tuple[int, int, int, int, int]) -> Moments:
     """Return the moments of one component whose count, total, squares, least and largest are whole numbers."""
     count, total, squares, low, high = sums
@@ -166,6 +174,8 @@ def column_moments(name: str, values: npt.NDArray[Any], is_last: npt.NDArray[np.
         return _scan_moments(values)
     if name == "rings":
         return _rings_moments(values)
+    if name == "scan_label":
+        return _label_moments(values)
     components = values.shape[-1] if name in VECTOR_COLUMNS else 1
     if name in _MEANINGLESS_ON_LAST_ROW:
         values = values[~is_last]

@@ -22,7 +22,7 @@ from navrep_data.shards.origin import ORIGIN_FILE, read_origin
 from navrep_data.shards.reader import Shard
 from navrep_data.shards.statistics import ShardStatistics, merge_statistics, scan_scale
 from navrep_data.shards.worlds import MAX_WORLDS_BYTES, parse_worlds
-from navrep_data.shards.writer import canonical, check_finite, check_index, sequence_hash
+from navrep_data.shards.writer import canonical, check_finite, check_index, check_labels, sequence_hash
 
 MAX_PROBLEMS_PER_FILE = 20
 MAX_SEQUENCE_BYTES = 4 << 30
@@ -139,7 +139,7 @@ def verify(root: Path | str, *, progress: Callable[[int, int], None] | None = No
         report.problems += found
         report.shards += 1
         report.rows += entry.rows
-        report.sequences += entry.sequences[1] - entry.sequences[0]
+        report.sequences += entry.count
         report.files += 2 if entry.worlds else 1
         report.bytes += entry.bytes + (entry.worlds.bytes if entry.worlds else 0)
         if progress is not None:
@@ -240,23 +240,25 @@ def _check_rows(
     shard: Shard, manifest: Manifest, entry: ShardEntry
 ) -> Generator[Problem, None, npt.NDArray[Any] | None]:
     """Check the rows, one sequence in memory at a time; return (sequence, episode, row) of each episode."""
-    first, stop = entry.sequences
+    numbers = np.array(entry.numbers)
     sequence = shard.read("sequence", 0, shard.rows)
-    bounds = np.searchsorted(sequence, np.arange(first, stop + 1))
-    if bounds[0] != 0 or bounds[-1] != shard.rows or (np.diff(bounds) < 1).any():
-        yield Problem(entry.file, f"column 'sequence' does not go from {first} to {stop - 1} without gaps")
+    begins = np.flatnonzero(np.append(True, sequence[1:] != sequence[:-1]))
+    if not np.array_equal(sequence[begins], numbers):
+        yield Problem(entry.file, "column 'sequence' does not hold the sequences of the manifest, each in one run")
         return None
+    bounds = np.append(begins, shard.rows)
     statistics = ShardStatistics(scan_scale(shard.columns["scan"].dtype))
     starts = []
     checked = 0
     for k, (low, high) in enumerate(itertools.pairwise(bounds.tolist())):
-        where = f"sequence {first + k}"
+        number = int(numbers[k])
+        where = f"sequence {number}"
         size = (high - low) * sum(layout.row_bytes for layout in shard.columns.values())
         if size > MAX_SEQUENCE_BYTES:
             yield Problem(entry.file, f"{where}: {high - low:,} rows take {size:,} bytes, too many to be checked")
             return None
         columns = {name: canonical(shard.read(name, low, high)) for name in shard.columns}
-        problem = check_index(columns, first + k)
+        problem = check_index(columns, number)
         if problem:
             yield Problem(entry.file, f"{where}: {problem}")
             continue
@@ -269,7 +271,7 @@ def _check_rows(
             checked += 1
         rows = np.flatnonzero(columns["is_first"])
         starts.append(np.stack([columns["sequence"][rows], columns["episode"][rows], rows + low], axis=1))
-    if checked == stop - first and statistics.to_dict() != entry.statistics:
+    if checked == entry.count and statistics.to_dict() != entry.statistics:
         yield Problem(entry.file, "its statistics in the manifest are not those of its rows")
     return np.concatenate(starts) if starts else None
 
@@ -286,6 +288,9 @@ def _check_values(columns: Columns, manifest: Manifest) -> Iterator[str]:
             yield f"column 'scan' holds values outside 0 to {manifest.sensor.range_max} m"
     if "rings" in columns and not np.array_equal(columns["rings"], scan_to_rings(scan)):
         yield "column 'rings' is not scan_to_rings of column 'scan'"
+    problem = check_labels(columns)
+    if problem:
+        yield problem
     last = columns["is_last"]
     for name in ("action", "reward"):
         if columns[name][last].any():

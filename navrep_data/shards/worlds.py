@@ -11,7 +11,7 @@ import io
 import struct
 import zipfile
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,31 @@ _MAP_FIELDS: dict[str, tuple[str, tuple[int, ...], str]] = {
 }
 MAP_WORLD_FIELDS = tuple(_MAP_FIELDS)
 """Names of the arrays that the worlds files of datasets on maps have besides, in file order."""
+# Reserved for what is drawn per episode. A group is there as a whole or not at all.
+_DRAWN_GROUPS: tuple[dict[str, tuple[str, tuple[int, ...], str]], ...] = (
+    {
+        "robot_max_velocity": ("<f4", (3,), "episode"),
+        "robot_acceleration": ("<f4", (3,), "episode"),
+        "robot_drive": ("|S64", (), "episode"),
+    },
+    {"footprint_offset": ("<i8", (), "episode+1"), "footprint": ("<f4", (2,), "corner")},
+    {
+        "lidar_offset": ("<i8", (), "episode+1"),
+        "lidar_pose": ("<f4", (3,), "lidar"),
+        "lidar_rays": ("<i4", (), "lidar"),
+        "lidar_angles": ("<f4", (2,), "lidar"),
+        "lidar_ranges": ("<f4", (2,), "lidar"),
+    },
+    {"human_model": ("|S64", (), "human"), "human_radius": ("<f4", (), "human")},
+)
+_ALL_FIELDS = {k: v for group in (_FIELDS, _MAP_FIELDS, *_DRAWN_GROUPS) for k, v in group.items()}
+DRAWN_WORLD_FIELDS = tuple(name for group in _DRAWN_GROUPS for name in group)
+"""Names of the arrays that are reserved for what is drawn per episode, in file order."""
+# The array whose entries say where an episode's rows along an axis begin.
+_OFFSETS = {
+    "polygon+1": "episode_polygon_offset", "vertex": "polygon_offset", "human": "human_offset",
+    "corner": "footprint_offset", "lidar": "lidar_offset",
+}  # fmt: skip
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -91,6 +116,11 @@ class EpisodeWorld:
         Gait distances accumulated at the episode's first row [m, m, rad].
     map, map_hash, scenario : str
         On maps: the map's name, its content's hash (``GridMap.hash``) and the scenario's name; '' elsewhere.
+    drawn : dict of str to ndarray
+        What else the episode drew, by name, where the file has it: of the robot ``robot_max_velocity`` (3,) and
+        ``robot_acceleration`` (3,) [m, rad, s], ``robot_drive``, ``footprint`` (V, 2) [m]; of its L lidars
+        ``lidar_pose`` (L, 3), ``lidar_rays``, ``lidar_angles`` (L, 2) first and increment [rad], ``lidar_ranges``
+        (L, 2) least and most [m]; of H humans ``human_model`` and ``human_radius`` [m].
     """
 
     sequence: int
@@ -109,6 +139,7 @@ class EpisodeWorld:
     map: str = ""
     map_hash: str = ""
     scenario: str = ""
+    drawn: Arrays = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -157,12 +188,26 @@ class Worlds:
             human_sees_robot=a["human_sees_robot"][h],
             human_gait=a["human_gait"][h],
             **{name: a[name][index].decode("ascii", "replace") for name in MAP_WORLD_FIELDS if name in a},
+            drawn={
+                name: self._drawn(name, index)
+                for name in DRAWN_WORLD_FIELDS
+                if name in a and name not in _OFFSETS.values()
+            },
         )
+
+    def _drawn(self, name: str, index: int) -> npt.NDArray[Any]:
+        """Return the part of an array that belongs to an episode."""
+        axis = _ALL_FIELDS[name][2]
+        if axis == "episode":
+            return np.asarray(self.arrays[name][index])
+        start, stop = self.arrays[_OFFSETS[axis]][index : index + 2]
+        return self.arrays[name][start:stop]
 
 
 def _fields_of(names: Collection[str]) -> dict[str, tuple[str, tuple[int, ...], str]]:
     """Return the fields that a worlds file with these arrays should have."""
-    return _FIELDS | _MAP_FIELDS if any(name in names for name in _MAP_FIELDS) else _FIELDS
+    groups = [group for group in (_MAP_FIELDS, *_DRAWN_GROUPS) if any(name in names for name in group)]
+    return _FIELDS | {name: kind for group in groups for name, kind in group.items()}
 
 
 def check_worlds(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
@@ -182,18 +227,16 @@ def check_worlds(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
         if array.dtype != np.dtype(dtype) or array.ndim != 1 + len(tail) or array.shape[1:] != tail:
             wanted = f"{np.dtype(dtype)} ({', '.join(['n', *map(str, tail)])})"
             return f"array {name!r} is {array.dtype} {array.shape}, expected {wanted}"
-    sizes = {
-        "episode": len(arrays["episode"]),
-        "human": len(arrays["human_start"]),
-        "vertex": len(arrays["vertices"]),
-    }
+    firsts = {"episode": "episode", "human": "human_start", "vertex": "vertices", "polygon+1": "polygon_offset",
+              "corner": "footprint", "lidar": "lidar_pose"}  # fmt: skip
+    sizes = {axis: len(arrays[name]) for axis, name in firsts.items() if name in arrays}
     sizes["episode+1"] = sizes["episode"] + 1
-    sizes["polygon+1"] = len(arrays["polygon_offset"])
     for name, (_, _, axis) in fields.items():
         if len(arrays[name]) != sizes[axis]:
             return f"array {name!r} has {len(arrays[name])} entries, expected {sizes[axis]}"
-    ends = {"polygon_offset": "vertex", "human_offset": "human", "episode_polygon_offset": "polygon+1"}
-    for name, axis in ends.items():
+    for axis, name in _OFFSETS.items():
+        if name not in arrays:
+            continue
         offset = arrays[name]
         end = sizes[axis] - (axis == "polygon+1")
         if not len(offset) or offset[0] != 0 or offset[-1] != end or (np.diff(offset) < 0).any():
@@ -220,9 +263,14 @@ def as_worlds(arrays: Mapping[str, npt.ArrayLike]) -> Arrays:
 
 
 def concatenate_worlds(parts: Sequence[Arrays]) -> Arrays:
-    """Join the worlds of consecutive sequences; offsets, each starting at 0, are moved up."""
+    """Join the worlds of consecutive sequences; offsets, each starting at 0, are moved up.
+
+    What was drawn per episode is kept where all of them have it.
+    """
     result: Arrays = {}
-    fields = _fields_of([name for part in parts for name in part])
+    in_all = set(parts[0]).intersection(*parts[1:])
+    known = _fields_of({name for part in parts for name in part})
+    fields = {name: kind for name, kind in known.items() if name in in_all or name not in DRAWN_WORLD_FIELDS}
     for name, (dtype, tail, axis) in fields.items():
         if axis.endswith("+1"):
             pieces, base = [np.zeros(1, dtype)], 0
@@ -247,11 +295,15 @@ def take_episodes(arrays: Mapping[str, npt.NDArray[Any]], first: int, stop: int)
     """
     polygon = slice(*arrays["episode_polygon_offset"][[first, stop]])
     parts = {
+        axis: slice(*arrays[name][[first, stop]])
+        for axis, name in _OFFSETS.items()
+        if name in arrays and axis not in ("polygon+1", "vertex")
+    }
+    parts |= {
         "episode": slice(first, stop),
         "episode+1": slice(first, stop + 1),
         "polygon+1": slice(polygon.start, polygon.stop + 1),
         "vertex": slice(*arrays["polygon_offset"][[polygon.start, polygon.stop]]),
-        "human": slice(*arrays["human_offset"][[first, stop]]),
     }
     result: Arrays = {}
     for name, (_, _, axis) in _fields_of(arrays).items():
@@ -297,7 +349,7 @@ def _member(archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
     if np.lib.format.read_magic(stream) != (1, 0):
         raise ValueError(f"array {name!r} is not npy version 1.0")
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    wanted = (_FIELDS | _MAP_FIELDS)[name][0]
+    wanted = _ALL_FIELDS[name][0]
     if dtype != np.dtype(wanted) or (fortran and len(shape) > 1):
         raise ValueError(f"array {name!r} is {dtype}, expected {wanted} in C order")
     data = stream.read()
@@ -347,7 +399,7 @@ def read_worlds(path: Path | str) -> Worlds:
     Parameters
     ----------
     path : path-like
-        ``worlds/shard-NNNNN.npz`` of a dataset.
+        ``worlds/train-NNNNN.npz`` of a dataset, or of another split.
 
     Raises
     ------

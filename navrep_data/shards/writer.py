@@ -20,11 +20,20 @@ import numpy.typing as npt
 
 from navrep_data.errors import ConfigError, CorruptDataError
 from navrep_data.io import atomic_write_bytes, sha256_bytes, translate_os_error
-from navrep_data.schema import COLUMNS, EVENT_NAMES, FORMAT_NAME, FORMAT_VERSION, Event, SensorContract
+from navrep_data.schema import (
+    COLUMNS,
+    CONTACT_STATIC,
+    EVENT_NAMES,
+    FORMAT_NAME,
+    FORMAT_VERSION,
+    LABEL_HUMAN,
+    Event,
+    SensorContract,
+)
 from navrep_data.shards._attributes import write_attribute
 from navrep_data.shards._codec import DEFLATE_LEVEL, encode
 from navrep_data.shards._layout import Layout, column_attributes, layouts, little_endian
-from navrep_data.shards.entries import FileEntry, ShardEntry, shard_file, worlds_file
+from navrep_data.shards.entries import SPLITS, FileEntry, Ranges, ShardEntry, ranges_of, shard_file, worlds_file
 from navrep_data.shards.statistics import ShardStatistics, scan_scale
 from navrep_data.shards.worlds import Arrays, as_worlds, concatenate_worlds, worlds_bytes
 
@@ -48,8 +57,10 @@ class ShardImage:
     ----------
     rows : int
         Number of rows.
-    sequences : tuple of int
-        First sequence and the one after the last.
+    split : str
+        The split that it belongs to.
+    sequences : tuple of (start, stop)
+        Numbers of its sequences, as ranges [start, stop).
     data : bytes
         The HDF5 file.
     data_sha256 : str
@@ -65,7 +76,8 @@ class ShardImage:
     """
 
     rows: int
-    sequences: tuple[int, int]
+    split: str
+    sequences: Ranges
     data: bytes
     data_sha256: str
     worlds: bytes | None
@@ -104,6 +116,18 @@ def sequence_hash(columns: Columns) -> str:
             digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode("ascii"))
             digest.update(array.reshape(-1).view(np.uint8).data)
     return digest.hexdigest()
+
+
+def check_labels(columns: Columns) -> str:
+    """Return what is wrong with the labels and contacts of one sequence, or an empty string."""
+    if "scan_label" in columns and "humans" in columns:
+        slots, most = columns["humans"].shape[1], int(columns["scan_label"].max())
+        if most >= LABEL_HUMAN + slots:
+            limit = LABEL_HUMAN + slots - 1
+            return f"column 'scan_label' holds {most}, expected at most {limit}: 'humans' has {slots} slots"
+    if "contact" in columns and columns["contact"].max() > CONTACT_STATIC:
+        return f"column 'contact' holds {int(columns['contact'].max())}, expected 0 to {CONTACT_STATIC}"
+    return ""
 
 
 def check_index(columns: Columns, sequence: int) -> str:
@@ -165,8 +189,8 @@ class ShardWriter:
         Slots of the humans column (ignored without it).
     length : int
         Rows of a sequence; a sequence may have fewer.
-    first_sequence : int
-        Index of the first sequence.
+    split : str
+        The split that all its sequences belong to.
 
     Raises
     ------
@@ -185,16 +209,17 @@ class ShardWriter:
         columns: Sequence[str],
         max_humans: int,
         length: int,
-        first_sequence: int,
+        split: str,
     ) -> None:
         if not 0 <= seed < 1 << 64:
             raise ConfigError(f"seed is {seed}; expected 0 to 2**64 - 1.")
-        if not 0 <= first_sequence < 1 << 31:
-            raise ConfigError(f"first_sequence is {first_sequence}; expected 0 to 2**31 - 1.")
+        if split not in SPLITS:
+            raise ConfigError(f"split is {split!r}; expected one of: {', '.join(SPLITS)}.")
         self.layouts = layouts(columns, sensor, scan_dtype, max_humans, length)
         self._env, self._config, self._seed, self._sensor = env, config, seed, sensor
-        self._length, self._first_sequence = length, first_sequence
+        self._length, self._split = length, split
         self._rows = 0
+        self._numbers: list[int] = []
         self._chunks: dict[str, list[bytes]] = {name: [] for name in self.layouts}
         self._pending: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in self.layouts}
         self._hashes: list[str] = []
@@ -202,11 +227,18 @@ class ShardWriter:
         self._statistics = ShardStatistics(scan_scale(self.layouts["scan"].dtype))
         self._finished = False
 
-    def append(self, columns: Columns, worlds: Mapping[str, npt.ArrayLike] | None = None) -> None:
+    @property
+    def count(self) -> int:
+        """Number of sequences so far."""
+        return len(self._numbers)
+
+    def append(self, index: int, columns: Columns, worlds: Mapping[str, npt.ArrayLike] | None = None) -> None:
         """Add one sequence.
 
         Parameters
         ----------
+        index : int
+            Its number in the dataset, larger than those before it.
         columns : mapping of str to ndarray
             Every column, of 1 to `length` rows, in exactly the stored dtype.
         worlds : mapping of str to array_like, optional
@@ -221,7 +253,9 @@ class ShardWriter:
         """
         if self._finished:
             raise RuntimeError("ShardWriter.finish was called; expected no more sequences. Make a new ShardWriter.")
-        index = self._first_sequence + len(self._hashes)
+        least = self._numbers[-1] + 1 if self._numbers else 0
+        if not least <= index < 1 << 31:
+            raise ConfigError(f"The sequence's number is {index}; expected {least} to 2**31 - 1.")
         ready = self._checked(columns, index)
         part = None
         if worlds is not None:
@@ -236,6 +270,7 @@ class ShardWriter:
             self._worlds.append(part)
         self._statistics.add(ready)
         self._hashes.append(sequence_hash(ready))
+        self._numbers.append(index)
         for name, array in ready.items():
             self._store(name, array)
         self._rows += len(ready["step"])
@@ -263,7 +298,7 @@ class ShardWriter:
             raise CorruptDataError(f"{where}: {bad}; expected finite numbers.")
         if "rings" in ready and ready["rings"].max() > 2:
             raise CorruptDataError(f"{where}: column 'rings' holds {ready['rings'].max()}; expected 0, 1 or 2.")
-        problem = check_index(ready, index)
+        problem = check_labels(ready) or check_index(ready, index)
         if problem:
             raise CorruptDataError(f"{where}: {problem}.")
         return ready
@@ -314,7 +349,8 @@ class ShardWriter:
         worlds = worlds_bytes(concatenate_worlds(self._worlds)) if self._worlds else None
         return ShardImage(
             rows=self._rows,
-            sequences=(self._first_sequence, self._first_sequence + len(self._hashes)),
+            split=self._split,
+            sequences=ranges_of(self._numbers),
             data=data,
             data_sha256=sha256_bytes(data),
             worlds=worlds,
@@ -331,7 +367,9 @@ class ShardWriter:
             "env": self._env,
             "config": json.dumps(self._config, allow_nan=False),
             "seed": np.uint64(self._seed),
-            "sequences": np.array([self._first_sequence, self._first_sequence + len(self._hashes)], dtype="<i8"),
+            "split": self._split,
+            "first_sequence": np.int64(self._numbers[0]),
+            "sequences": np.int64(len(self._numbers)),
             "rows": np.int64(self._rows),
             "length": np.int64(self._length),
             "n_rays": np.int64(sensor.n_rays),
@@ -376,7 +414,7 @@ def publish(root: Path | str, index: int, image: ShardImage) -> ShardEntry:
     root : path-like
         Dataset folder (must exist).
     index : int
-        Number of the shard.
+        Number of the shard in its split.
     image : ShardImage
         From :meth:`ShardWriter.finish`.
 
@@ -403,20 +441,21 @@ def publish(root: Path | str, index: int, image: ShardImage) -> ShardEntry:
 
 def shard_files(index: int, image: ShardImage) -> list[tuple[str, bytes]]:
     """Return names and contents of a shard's files, in the order in which to write them: worlds first."""
-    worlds = [] if image.worlds is None else [(worlds_file(index), image.worlds)]
-    return [*worlds, (shard_file(index), image.data)]
+    worlds = [] if image.worlds is None else [(worlds_file(image.split, index), image.worlds)]
+    return [*worlds, (shard_file(image.split, index), image.data)]
 
 
 def shard_entry(index: int, image: ShardImage) -> ShardEntry:
     """Return what the manifest lists of a shard that is in its place."""
     worlds = None
     if image.worlds is not None and image.worlds_sha256 is not None:
-        worlds = FileEntry(worlds_file(index), image.worlds_sha256, len(image.worlds))
+        worlds = FileEntry(worlds_file(image.split, index), image.worlds_sha256, len(image.worlds))
     return ShardEntry(
-        file=shard_file(index),
+        file=shard_file(image.split, index),
         sha256=image.data_sha256,
         bytes=len(image.data),
         rows=image.rows,
+        split=image.split,
         sequences=image.sequences,
         worlds=worlds,
         statistics=image.statistics,

@@ -10,10 +10,10 @@ from navrep_data.sim._step import observe_humans, observe_scan, observe_state, r
 
 
 @kernel
-def seed_worlds(rng, scalars, seed, first_sequence):
-    """Give world w the stream of sequence first_sequence + w and forget all episodes."""
+def seed_worlds(rng, scalars, seed, sequences):
+    """Give world w the stream of sequence sequences[w] and forget all episodes."""
     for w in range(rng.shape[0]):
-        seed_philox(rng[w], seed, first_sequence + w)
+        seed_philox(rng[w], seed, sequences[w])
         scalars[w, :] = 0.0
         scalars[w, S_EPISODE] = -1.0
 

@@ -4,6 +4,7 @@
 import numpy as np
 
 from navrep_data.kernels import kernel
+from navrep_data.schema import CONTACT_NONE
 from navrep_data.sim._ian_layout import (
     M_MAP,
     M_SCENARIO,
@@ -26,6 +27,7 @@ from navrep_data.sim._layout import (
     F_POLICY,
     F_SCAN_MM,
     F_WANT_HUMANS,
+    F_WANT_LABELS,
     P_DT,
     P_OMEGA_NOISE,
     P_POLICY_SPEED,
@@ -40,7 +42,7 @@ from navrep_data.sim._layout import (
 )
 from navrep_data.sim._rng import uniform
 from navrep_data.sim._rollout import _momentum, _steer, note_episode, store_scan
-from navrep_data.sim._step import observe_humans
+from navrep_data.sim._step import contact_of, label_rays, observe_humans
 
 
 @kernel
@@ -93,7 +95,7 @@ def choose_on_map(w, worlds, maps, orca, path, params, flags, rules, memory, act
 @kernel
 def begin_map_row(
     w, row, worlds, maps, rules, bodies, dirs, inv_work, owner_work, hits, scan32, params, flags, no_corners, no_start,
-    out_scan, out_floats, out_ints, out_humans, episodes, corners, sizes, humans, counts, places,
+    out_scan, out_floats, out_ints, out_humans, out_labels, episodes, corners, sizes, humans, counts, places,
 ):  # fmt: skip
     """Observe world w from robot 0 and write this row's observation; on an episode's first row also who is where.
 
@@ -118,6 +120,9 @@ def begin_map_row(
     out_floats[9], out_floats[10] = walkers[0, W_SHOWN_X], walkers[0, W_SHOWN_Y]
     out_floats[11], out_floats[12] = walkers[0, W_SHOWN_HEADING], agents[0, A_RADIUS]
     out_ints[0], out_ints[1], out_ints[2] = NONE, int(scalars[S_EPISODE]), int(scalars[S_STEP])
+    out_ints[3] = CONTACT_NONE
+    if flags[F_WANT_LABELS]:
+        label_rays(owner_work, int(scalars[S_HUMANS]), out_labels)
     if flags[F_WANT_HUMANS]:
         observe_humans(0, agents, robots, int(scalars[S_HUMANS]), hits, out_humans)
 
@@ -154,6 +159,8 @@ def finish_map_row(
         )  # fmt: skip
         out_floats[5], out_floats[6], out_floats[7] = actions[0, 0], actions[0, 1], actions[0, 2]
         out_floats[8] = rewards[0]
+        agents = worlds.agents[w]
+        out_ints[3] = contact_of(agents, int(rules[R_ROBOTS]), int(rules[R_ROBOTS]) + int(scalars[S_HUMANS]))
         return int(scalars[S_EVENT])
     if not last and not reset_map_world(
         worlds.agents[w], worlds.walkers[w], worlds.contacts[w], scalars, worlds.place[w], worlds.own_field[w],
@@ -166,16 +173,17 @@ def finish_map_row(
 @kernel
 def begin_map_rows(
     row, worlds, maps, rules, bodies, dirs, inv_work, owner_work, hits, scans, params, flags, no_corners, no_start,
-    out_scan, out_floats, out_ints, out_humans, episodes, corners, sizes, humans, counts, places,
+    out_scan, out_floats, out_ints, out_humans, out_labels, episodes, corners, sizes, humans, counts, places,
 ):  # fmt: skip
     """Call :func:`begin_map_row` on every world of a batch."""
     robots = int(rules[R_ROBOTS])
     for w in range(worlds.agents.shape[0]):
         humans_row = row if flags[F_WANT_HUMANS] else 0
+        labels_row = row if flags[F_WANT_LABELS] else 0
         begin_map_row(
             w, row, worlds, maps, rules, bodies, dirs, inv_work, owner_work, hits[w * robots], scans[w], params, flags,
             no_corners, no_start, out_scan[w, row], out_floats[w, row], out_ints[w, row], out_humans[w, humans_row],
-            episodes[w], corners[w], sizes[w], humans[w], counts[w], places[w],
+            out_labels[w, labels_row], episodes[w], corners[w], sizes[w], humans[w], counts[w], places[w],
         )  # fmt: skip
 
 

@@ -35,13 +35,16 @@ from navrep_data.sim._layout import (
     A_GY,
     A_RADIUS,
     F_NOISE,
+    F_WANT_LABELS,
     P_ANGLE_INCREMENT,
     P_ANGLE_MIN,
     P_RANGE_MAX,
+    RAY_NOTHING,
     S_HUMANS,
 )
 from navrep_data.sim._lidar import BEARING_ERROR, CIRCLE_OWNER
 from navrep_data.sim._noise import disturb
+from navrep_data.sim._step import note_static
 
 TWO_PI = 2.0 * np.pi
 
@@ -120,7 +123,9 @@ def scan_map_world(
             inv_work, owner_work, hits, out,
         )  # fmt: skip
     if not original:
-        _see_rim(map_row, width, height, x, y, theta, dirs, out)
+        _see_rim(map_row, width, height, x, y, theta, dirs, owner_work, out)
+    if flags[F_WANT_LABELS]:
+        note_static(owner_work, range_max, out)
     if flags[F_NOISE]:
         disturb(scalars, i, params, out)
 
@@ -134,7 +139,7 @@ def other_slot(i, j, robots, n_humans):
 
 
 @kernel
-def _see_rim(map_row, width, height, x, y, theta, dirs, out):
+def _see_rim(map_row, width, height, x, y, theta, dirs, owner_of_ray, out):
     """Cut ranges where rays leave the map: its rim is as solid to the lidar as it is to the robot."""
     resolution = map_row[T_RESOLUTION]
     left, low = map_row[T_X0] - x, map_row[T_Y0] - y
@@ -145,7 +150,10 @@ def _see_rim(map_row, width, height, x, y, theta, dirs, out):
         s = st * dirs[0, k] + ct * dirs[1, k]
         tx = (right if c > 0.0 else left) / c if c != 0.0 else np.inf
         ty = (high if s > 0.0 else low) / s if s != 0.0 else np.inf
-        out[k] = min(out[k], np.float32(max(min(tx, ty), 0.0)))
+        rim = np.float32(max(min(tx, ty), 0.0))
+        if rim < out[k]:
+            out[k] = rim
+            owner_of_ray[k] = RAY_NOTHING  # who stands behind it is not seen
 
 
 @kernel

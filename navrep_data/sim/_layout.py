@@ -117,7 +117,12 @@ F_DAMAGE = 13  # 1: collisions do damage and put back, 0: they end the episode
 F_ADAPTIVE = 14  # 1: adaptive curriculum
 F_NOISE = 15  # 1: scans have noise or dropout
 F_HIDE_OMEGA = 16  # 1: the robot state shows a rotation of 0
-FLAG_FIELDS = 17
+F_WANT_LABELS = 17  # 1: note what static matter each ray hits, and fill the column scan_label
+FLAG_FIELDS = 18
+
+# --- owners of rays, beside agents by their place among the others ---------------------------------------------------
+RAY_NOTHING = -1  # where labels are not wanted also static matter
+RAY_STATIC = -2
 
 WORLD_POLYGONS = 0
 WORLD_EMPTY = 1

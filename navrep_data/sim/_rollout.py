@@ -8,6 +8,7 @@ order, so a sequence has the same bytes however it was made.
 import numpy as np
 
 from navrep_data.kernels import kernel
+from navrep_data.schema import CONTACT_NONE
 from navrep_data.sim._judge import CUT, NONE, STUCK
 from navrep_data.sim._layout import (
     A_GAIT_T,
@@ -26,6 +27,7 @@ from navrep_data.sim._layout import (
     F_ROBOTS,
     F_SCAN_MM,
     F_WANT_HUMANS,
+    F_WANT_LABELS,
     P_DT,
     P_OMEGA_NOISE,
     P_POLICY_SPEED,
@@ -44,6 +46,8 @@ from navrep_data.sim._layout import (
 )
 from navrep_data.sim._rng import uniform
 from navrep_data.sim._step import (
+    contact_of,
+    label_rays,
     observe_humans,
     observe_scan,
     observe_state,
@@ -208,7 +212,7 @@ def note_episode(row, agents, robots, scalars, vertices, polygon_start, episodes
 @kernel
 def begin_row(
     row, agents, scalars, vertices, polygon_start, edges, circles, dirs, inv_work, owner_work, hits, scan32,
-    params, flags, out_scan, out_floats, out_ints, out_humans, episodes, corners, sizes, humans, counts,
+    params, flags, out_scan, out_floats, out_ints, out_humans, out_labels, episodes, corners, sizes, humans, counts,
 ):  # fmt: skip
     """Observe a world from robot 0 and write this row's observation; on an episode's first row also its static side."""
     robots = flags[F_ROBOTS]
@@ -245,6 +249,9 @@ def begin_row(
     out_ints[row, 0] = NONE
     out_ints[row, 1] = int(scalars[S_EPISODE])
     out_ints[row, 2] = int(scalars[S_STEP])
+    out_ints[row, 3] = CONTACT_NONE
+    if flags[F_WANT_LABELS]:
+        label_rays(owner_work, int(scalars[S_HUMANS]), out_labels[row])
     if flags[F_WANT_HUMANS]:
         observe_humans(0, agents, robots, int(scalars[S_HUMANS]), hits, out_humans[row])
 
@@ -278,6 +285,7 @@ def finish_row(
         )  # fmt: skip
         out_floats[row, 5], out_floats[row, 6], out_floats[row, 7] = action[0], action[1], action[2]
         out_floats[row, 8] = result[0]
+        out_ints[row, 3] = contact_of(agents, flags[F_ROBOTS], flags[F_ROBOTS] + int(scalars[S_HUMANS]))
         return int(result[flags[F_ROBOTS]])
     return OVER
 
@@ -286,7 +294,7 @@ def finish_row(
 def rollout_sequence(
     agents, agents32, scalars, vertices, polygon_start, edges, obst_f, obst_i, boxes, rng, circles, dirs,
     inv_work, owner_work, hits, scan32, work_f, work_i, moves, params, flags, orca_params,
-    out_scan, out_floats, out_ints, out_humans, episodes, corners, sizes, humans, counts,
+    out_scan, out_floats, out_ints, out_humans, out_labels, episodes, corners, sizes, humans, counts,
 ):  # fmt: skip
     """Simulate one sequence under a scripted policy into the out arrays; returns False if no world could be made.
 
@@ -309,7 +317,8 @@ def rollout_sequence(
     for row in range(length):
         begin_row(
             row, agents, scalars, vertices, polygon_start, edges, circles, dirs, inv_work, owner_work, hits, scan32,
-            params, flags, out_scan, out_floats, out_ints, out_humans, episodes, corners, sizes, humans, counts,
+            params, flags, out_scan, out_floats, out_ints, out_humans, out_labels, episodes, corners, sizes, humans,
+            counts,
         )  # fmt: skip
         gave_up = False
         if pending == NONE and row < length - 1:
@@ -334,13 +343,13 @@ def rollout_sequence(
 @kernel
 def begin_rows(
     row, agents, scalars, vertices, polygon_start, edges, circles, dirs, inv_work, owner_work, hits, scan32,
-    params, flags, out_scan, out_floats, out_ints, out_humans, episodes, corners, sizes, humans, counts,
+    params, flags, out_scan, out_floats, out_ints, out_humans, out_labels, episodes, corners, sizes, humans, counts,
 ):  # fmt: skip
     """Call :func:`begin_row` on every world of a batch (arrays with a leading world axis)."""
     for w in range(agents.shape[0]):
         begin_row(
             row, agents[w], scalars[w], vertices[w], polygon_start[w], edges[w], circles, dirs, inv_work, owner_work,
-            hits[w], scan32[w], params, flags, out_scan[w], out_floats[w], out_ints[w], out_humans[w],
+            hits[w], scan32[w], params, flags, out_scan[w], out_floats[w], out_ints[w], out_humans[w], out_labels[w],
             episodes[w], corners[w], sizes[w], humans[w], counts[w],
         )  # fmt: skip
 

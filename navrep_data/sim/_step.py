@@ -4,6 +4,16 @@
 import numpy as np
 
 from navrep_data.kernels import kernel
+from navrep_data.schema import (
+    CONTACT_HUMAN,
+    CONTACT_NONE,
+    CONTACT_ROBOT,
+    CONTACT_STATIC,
+    LABEL_HUMAN,
+    LABEL_NOTHING,
+    LABEL_ROBOT,
+    LABEL_STATIC,
+)
 from navrep_data.sim._ellipse import body_ellipse, scan_ellipses
 from navrep_data.sim._judge import GOAL, NONE, judge, measure
 from navrep_data.sim._layout import (
@@ -19,6 +29,7 @@ from navrep_data.sim._layout import (
     A_OMEGA,
     A_RADIUS,
     A_SEES,
+    A_TOUCHED,
     A_VPREF,
     A_VX,
     A_VY,
@@ -36,6 +47,7 @@ from navrep_data.sim._layout import (
     F_NOISE,
     F_ORIGINAL,
     F_ROBOTS,
+    F_WANT_LABELS,
     F_WORLD,
     HUMANS_CONSTANT_VELOCITY,
     HUMANS_ORCA,
@@ -46,6 +58,8 @@ from navrep_data.sim._layout import (
     P_HUMANS,
     P_RANGE_MAX,
     P_SQUARES,
+    RAY_NOTHING,
+    RAY_STATIC,
     S_CLEAR_HUMAN,
     S_CLEAR_STATIC,
     S_EPISODE,
@@ -400,8 +414,41 @@ def observe_scan(
             params[P_ANGLE_MIN], params[P_ANGLE_INCREMENT], params[P_RANGE_MAX], flags[F_GAP_QUIRK],
             inv_work, owner_work, hits, out,
         )  # fmt: skip
+    if flags[F_WANT_LABELS]:
+        note_static(owner_work, params[P_RANGE_MAX], out)
     if flags[F_NOISE]:
         disturb(scalars, r, params, out)
+
+
+@kernel
+def note_static(owner_of_ray, range_max, scan):
+    """Give the rays of a scan without noise (n_rays,) [m] that hit something, but nobody, to static matter."""
+    for ray in range(scan.shape[0]):
+        if owner_of_ray[ray] == RAY_NOTHING and scan[ray] < np.float32(range_max):
+            owner_of_ray[ray] = RAY_STATIC
+
+
+@kernel
+def label_rays(owner_of_ray, n_humans, out):
+    """Fill out (n_rays,) uint8: 0 nothing, 1 static, 2 another robot, 3 + k the human in slot k."""
+    for ray in range(out.shape[0]):
+        owner = owner_of_ray[ray]
+        if owner >= 0:
+            out[ray] = LABEL_HUMAN + owner if owner < n_humans else LABEL_ROBOT
+        else:
+            out[ray] = LABEL_STATIC if owner == RAY_STATIC else LABEL_NOTHING
+
+
+@kernel
+def contact_of(agents, n_robots, n_agents):
+    """Return what the first robot touched in the last step: the first of human, other robot, static matter, or none."""
+    found = CONTACT_STATIC if agents[0, A_TOUCHED] > 0.0 else CONTACT_NONE
+    for j in range(1, n_agents):
+        if agents[j, A_TOUCHED] > 0.0:
+            if j >= n_robots:
+                return CONTACT_HUMAN
+            found = CONTACT_ROBOT
+    return found
 
 
 @kernel

@@ -63,15 +63,11 @@ class GridMap:
             raise ConfigError(f"resolution is {self.resolution}, expected a positive number of metres: correct it.")
         if len(self.origin) != 2 or not all(math.isfinite(value) for value in self.origin):
             raise ConfigError(f"origin is {self.origin}, expected two finite numbers of metres: correct it.")
-        left, right, low, high = (
-            *(self.origin[0] + k * self.resolution for k in (0, occupancy.shape[0])),
-            *(self.origin[1] + k * self.resolution for k in (0, occupancy.shape[1])),
-        )
-        if max(-left, right, -low, high) > MAX_COORDINATE:
+        size = max(occupancy.shape) * self.resolution
+        if size > MAX_COORDINATE:
             raise MapError(
-                f"Map '{self.name}' lies at x {left:.0f} to {right:.0f}, y {low:.0f} to {high:.0f} m, expected within "
-                f"{MAX_COORDINATE:.0f} m of 0, where float32 coordinates keep their millimetres: set the map's origin "
-                "near 0 and shift poses by as much."
+                f"Map '{self.name}' is {size:.0f} m long, expected at most {MAX_COORDINATE:.0f} m, where float32 "
+                "coordinates keep their millimetres: cut it."
             )
         occupancy.setflags(write=False)
         object.__setattr__(self, "occupancy", occupancy)
@@ -105,6 +101,11 @@ class GridMap:
         return content_hash(
             self.occupancy, self.resolution, self.origin, float(self.occupied_threshold), float(self.free_threshold)
         )
+
+    @cached_property
+    def local(self) -> GridMap:
+        """The same map with its origin at (0, 0): the frame that `consistent` physics simulates in."""
+        return self if self.origin == (0.0, 0.0) else dataclasses.replace(self, origin=(0.0, 0.0))
 
     def contains(self, xy: ArrayLike) -> NDArray[np.bool_]:
         """Return which places lie on the map.

@@ -50,6 +50,7 @@ class _MapSequences:
         flags = self.maps.arrays.flags
         flags[lay.F_SCAN_MM] = settings.scan_dtype == "uint16"
         flags[lay.F_WANT_HUMANS] = settings.humans
+        flags[lay.F_WANT_LABELS] = settings.labels
         self._names = np.array([_ascii(grid.name) for grid in self.maps.data.maps], f"S{NAME_BYTES}")
         self._hashes = np.array([_ascii(grid.hash) for grid in self.maps.data.maps], f"S{NAME_BYTES}")
         scenarios = [_ascii(scenario.name) for scenario in self.maps.data.scenarios]
@@ -58,7 +59,7 @@ class _MapSequences:
     def begin(self, seed: int, sequences: Sequence[int]) -> None:
         """Seed the worlds and start their first episodes."""
         a = self.maps.arrays
-        seed_worlds(a.rng, a.scalars, seed, sequences[0])
+        seed_worlds(a.rng, a.scalars, seed, np.array(sequences))
         self.out.counts[:] = 0
         self.pending[:] = 0
         self.gave_up[:] = False
@@ -70,7 +71,7 @@ class _MapSequences:
         _ian_rollout.begin_map_rows(
             row, a.worlds, self.maps.data.tables, a.rules, a.circles, a.dirs, a.inv_work, a.owner_work, a.hits, a.scans,
             a.params, a.flags, self._no_corners, self._no_start, out.scan, out.floats, out.ints, out.humans,
-            out.episodes, out.corners, out.sizes, out.table, out.counts, self.places,
+            out.labels, out.episodes, out.corners, out.sizes, out.table, out.counts, self.places,
         )  # fmt: skip
 
     def act(self, row: int) -> None:

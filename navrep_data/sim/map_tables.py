@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from navrep_data.errors import MapError
+from navrep_data.schema import MAX_COORDINATE
 from navrep_data.sim import _ian_layout as il
 from navrep_data.sim._map_edges import link_edges
 from navrep_data.sim._obstacles import OF_FIELDS, OI_FIELDS
@@ -44,7 +45,9 @@ class MapWorldData:
     Attributes
     ----------
     maps : tuple of GridMap
-        At full resolution.
+        At full resolution; in `consistent` physics with their origins at (0, 0), where their worlds are simulated.
+    origins : ndarray of shape (M, 2)
+        Where those maps' (0, 0) is in the frames of their files [m]; 0 in `original` physics.
     scenarios : tuple of Scenario
         Empty where starts and goals are random.
     tables : MapTables
@@ -54,6 +57,7 @@ class MapWorldData:
     """
 
     maps: tuple[GridMap, ...]
+    origins: NDArray[np.float64]
     scenarios: tuple[Scenario, ...]
     tables: il.MapTables
     edges: tuple[NDArray[np.float32], NDArray[np.int32]]
@@ -71,16 +75,38 @@ def map_world_data(config: SimConfig) -> MapWorldData:
     """
     scenarios = tuple(get_scenario(name) for name in config.scenarios)
     names = tuple(dict.fromkeys(s.map for s in scenarios)) if scenarios else config.maps
-    maps = tuple(load_map(file) for file in (names if scenarios else config.map_files))
+    given = tuple(load_map(file) for file in (names if scenarios else config.map_files))
+    consistent = config.physics == "consistent"
+    maps = tuple(map_for_physics(grid, config.physics) for grid in given)
+    origins = np.array([np.subtract(old.origin, new.origin) for old, new in zip(given, maps, strict=True)])
     pool = not scenarios and config.humans > 0
-    rim = config.physics == "consistent"
-    key = (config.scenarios, tuple(grid.hash for grid in maps), pool, rim)
+    key = (config.scenarios, tuple(grid.hash for grid in maps), origins.tobytes(), pool, consistent)
     if key not in _kept:
-        _kept[key] = _build(maps, scenarios, names, pool, rim)
+        _kept[key] = _build(maps, origins, scenarios, names, pool, consistent)
         while len(_kept) > TABLES_KEPT:
             _kept.popitem(last=False)
     _kept.move_to_end(key)
     return _kept[key]
+
+
+def map_for_physics(grid: GridMap, physics: str) -> GridMap:
+    """Return a map as it is simulated on: with its origin at (0, 0), in `original` physics where its file says.
+
+    Raises
+    ------
+    MapError
+        If `original` physics, which simulates in float32, would lose millimetres there.
+    """
+    if physics == "consistent":
+        return grid.local
+    left, right, low, high = grid.extent
+    if max(-left, right, -low, high) > MAX_COORDINATE:
+        raise MapError(
+            f"Map '{grid.name}' lies at x {left:.0f} to {right:.0f}, y {low:.0f} to {high:.0f} m, expected within "
+            f"{MAX_COORDINATE:.0f} m of 0, where float32 coordinates keep their millimetres: set the map's origin "
+            "near 0, or take physics 'consistent'."
+        )
+    return grid
 
 
 class _Flat:
@@ -103,8 +129,9 @@ class _Flat:
 
 
 def _build(
-    maps: tuple[GridMap, ...], scenarios: tuple[Scenario, ...], names: tuple[str, ...], pool: bool, rim: bool
-) -> MapWorldData:
+    maps: tuple[GridMap, ...], origins: NDArray[np.float64], scenarios: tuple[Scenario, ...], names: tuple[str, ...],
+    pool: bool, consistent: bool,
+) -> MapWorldData:  # fmt: skip
     table = np.zeros((len(maps), il.MAP_FIELDS))
     flats = {
         "solid": _Flat(np.uint8), "distance": _Flat(np.float32), "squares": _Flat(np.uint8), "pace": _Flat(np.float32),
@@ -115,7 +142,7 @@ def _build(
     pools: list[int] = []
     for m, grid in enumerate(maps):
         _add_map(table[m], grid, flats)
-        places = np.zeros((0, 2)) if scenarios else spawn_places(grid, rim)
+        places = np.zeros((0, 2)) if scenarios else spawn_places(grid, consistent)
         table[m, il.T_SPOTS] = sum(map(len, spots))
         spots.append(places)
         table[m, il.T_SPOTS_END] = table[m, il.T_SPOTS] + len(places)
@@ -123,7 +150,7 @@ def _build(
         if pool:
             pools += [fields.index(grid, goal) for goal in _spread(places, POOL_SIZE)]
         table[m, il.T_POOL_END] = len(pools)
-    rows, cast = _cast(maps, scenarios, names, fields)
+    rows, cast = _cast(maps, origins, scenarios, names, fields)
     edges = _edges(maps, table)
     tables = il.MapTables(
         table=table,
@@ -137,7 +164,7 @@ def _build(
         pool=np.array(pools or [0], np.int64),
     )
     # not made read-only, though nobody writes here: that is another type to a compiler, and copies would lose it
-    return MapWorldData(maps, scenarios, tables, edges)
+    return MapWorldData(maps, origins, scenarios, tables, edges)
 
 
 def _add_map(row: NDArray[np.float64], grid: GridMap, flats: dict[str, _Flat]) -> None:
@@ -177,15 +204,16 @@ class _Fields:
         return self.known[key]
 
 
-def spawn_places(grid: GridMap, off_rim: bool = True) -> NDArray[np.float64]:
-    """Return where robots may start and have goals on a map: centres of cells, (N, 2) [m], world frame.
+def spawn_places(grid: GridMap, consistent: bool = True) -> NDArray[np.float64]:
+    """Return where robots may start and have goals on a map: centres of cells, (N, 2) [m], in the map's frame.
 
     Parameters
     ----------
     grid : GridMap
         The map at full resolution.
-    off_rim : bool
-        Whether the map's edge counts as a wall.
+    consistent : bool
+        Whether the map's edge counts as a wall, and places are those of the largest connected region, wherever the
+        map's (0, 0) is; `unity_scene_map` is larger outside than inside, where places are to be.
 
     Raises
     ------
@@ -195,7 +223,8 @@ def spawn_places(grid: GridMap, off_rim: bool = True) -> NDArray[np.float64]:
     Notes
     -----
     The original coarsens its maps three times and takes the cells that are reachable from (0, 0) at 0.5 m from walls
-    (``pepper_2d_simulator.py``). Maps whose (0, 0) is no such place: the largest connected region.
+    (``pepper_2d_simulator.py``); so does this where not `consistent`. Maps whose (0, 0) is no such place: the largest
+    connected region.
     """
     passes = SPAWN_PASSES
     if grid.source != f"{grid.name}.yaml" or grid.name not in _ORIGINAL_SPAWN:
@@ -204,12 +233,13 @@ def spawn_places(grid: GridMap, off_rim: bool = True) -> NDArray[np.float64]:
             passes += 1
     # a map of few columns or rows cannot be halved as often
     coarse = grid.coarsened(min(passes, min(grid.shape).bit_length() - 1))
+    start = _INSIDE.get(grid.hash) if consistent else (0.0, 0.0)
     try:
-        free = coarse.reachable((0.0, 0.0), SPAWN_CLEARANCE)
+        free = _largest_region(coarse) if start is None else coarse.reachable(start, SPAWN_CLEARANCE)
     except MapError:
         free = _largest_region(coarse)
     places: NDArray[np.float64] = coarse.centre_of(np.argwhere(free))
-    if off_rim:
+    if consistent:
         left, right, low, high = grid.extent
         x, y = places.T
         near = np.minimum(np.minimum(x - left, right - x), np.minimum(y - low, high - y))
@@ -226,6 +256,11 @@ _ORIGINAL_SPAWN = frozenset(
     {"marktrain", "marksimple", "markcomplex", "marktm1", "marktm2", "marktm3", "markclutter", "markmaze"}
     | {f"crowdmove{k}" for k in range(1, 7)}
 )
+
+
+# The largest region of this map of the paper is the ground outside of the building; a place inside [m], and the hash of
+# the map with its origin at (0, 0), so that a copy at another origin is known, too.
+_INSIDE = {"28d739c1fe0aba965c54438af470912d": (23.0, 12.0)}
 
 
 def _largest_region(grid: GridMap) -> NDArray[np.bool_]:
@@ -253,7 +288,11 @@ def _spread(places: NDArray[np.float64], count: int) -> NDArray[np.float64]:
 
 
 def _cast(
-    maps: tuple[GridMap, ...], scenarios: tuple[Scenario, ...], names: tuple[str, ...], fields: _Fields
+    maps: tuple[GridMap, ...],
+    origins: NDArray[np.float64],
+    scenarios: tuple[Scenario, ...],
+    names: tuple[str, ...],
+    fields: _Fields,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     rows = np.zeros((len(scenarios), il.SCENARIO_FIELDS), np.int64)
     cast: list[list[float]] = []
@@ -261,22 +300,25 @@ def _cast(
         m = names.index(scenario.map)
         rows[s] = m, len(cast), scenario.humans
         for start, goal, chance in zip(scenario.starts, scenario.goals, scenario.permissivity, strict=True):
-            check_way(maps[m], start[:2], goal, fields, scenario.name)
-            cast.append([*start, *goal, chance, fields.index(maps[m], goal)])
+            check_way(maps[m], origins[m], start[:2], goal, fields, scenario.name)
+            here = goal - origins[m]
+            cast.append([*(start[:2] - origins[m]), start[2], *here, chance, fields.index(maps[m], here)])
     return rows, np.array(cast) if cast else np.zeros((0, il.CAST_FIELDS))
 
 
 def check_way(
-    grid: GridMap, start: NDArray[np.float64], goal: NDArray[np.float64], fields: _Fields, which: str
-) -> None:
-    """Check that one can stand at a start and go to a goal.
+    grid: GridMap, origin: NDArray[np.float64], start: NDArray[np.float64], goal: NDArray[np.float64], fields: _Fields,
+    which: str,
+) -> None:  # fmt: skip
+    """Check that one can stand at a start and go to a goal, both in the frame in which the map's (0, 0) is at `origin`.
 
     Raises
     ------
     MapError
         If the start is in or too near a wall, or the goal is out of reach.
     """
-    clearance = float(grid.signed_distance()[tuple(grid.cell_of(start))]) if grid.contains(start) else -np.inf
+    here, there = start - origin, goal - origin
+    clearance = float(grid.signed_distance()[tuple(grid.cell_of(here))]) if grid.contains(here) else -np.inf
     if clearance < RADIUS:
         where = f"{clearance:.2f} m from the nearest wall" if clearance > 0.0 else "inside a wall or on unknown ground"
         raise MapError(
@@ -285,9 +327,8 @@ def check_way(
             "free ground around it: move it."
         )
     plan = planning_map(grid)
-    index = fields.index(grid, goal)
-    field = fields.flat.parts[index].reshape(plan.shape)
-    if not np.isfinite(field[tuple(plan.cell_of(start))]):
+    field = fields.flat.parts[fields.index(grid, there)].reshape(plan.shape) if plan.contains(there) else None
+    if field is None or not np.isfinite(field[tuple(plan.cell_of(here))]):
         raise MapError(
             f"Scenario {which!r}: the goal ({goal[0]:g}, {goal[1]:g}) on map '{grid.name}' is out of reach from "
             f"({start[0]:g}, {start[1]:g}), expected a way round the walls: move one of them."

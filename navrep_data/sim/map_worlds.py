@@ -205,6 +205,10 @@ class MapWorlds:
         """Return the outlines of the world's map, simplified within 5 cm, for drawing."""
         return self.data.maps[self.map_index(world)].contours(0.05)
 
+    def origins(self) -> F64:
+        """Return where the worlds' (0, 0) is in the frames of their map files, (W, 2) [m]."""
+        return self.data.origins[self.arrays.worlds.place[:, il.M_MAP].astype(np.int64)]
+
     def map_index(self, world: int) -> int:
         """Return which of the config's maps a world is on."""
         return int(self.arrays.worlds.place[world, il.M_MAP])

@@ -64,7 +64,7 @@ def load_map(name_or_path: str | os.PathLike[str], *, occupancy: OccupancyRule |
     ----------
     name_or_path : str or path-like
         One of :func:`map_names`, or the path of a map_server YAML file or of a folder with one. A bare word is a name
-        first. Its files may be links. Coordinates must lie within 16 km of the origin.
+        first. Its files may be links.
     occupancy : {"original", "ros"}, optional
         How grey values v become occupancies. "original" is ``1 - v / 254``, the rule of the software behind the paper's
         maps; "ros" is ``(255 - v) / 255``, or ``v / 255`` with ``negate: 1``, the rule of map_server. The two part at

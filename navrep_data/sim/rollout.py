@@ -26,7 +26,7 @@ PolicyFunction = Callable[[NDArray[np.float32], NDArray[np.float32]], Any]
 
 # columns of the packed float output of the kernels
 _STATE, _ACTION, _REWARD, _POSE, _RADIUS = slice(0, 5), slice(5, 8), 8, slice(9, 12), 12
-_FLOATS, _INTS = 13, 3
+_FLOATS, _INTS = 13, 4
 _TERMINAL = np.array([event.terminal for event in Event])
 
 
@@ -40,14 +40,16 @@ class RolloutSettings:
         Rows per sequence.
     scan_dtype : str
         ``"uint16"`` millimetres or ``"float32"`` metres.
-    rings, humans : bool
-        Whether to fill these columns.
+    rings, humans, labels, contact : bool
+        Whether to fill these columns (labels: scan_label).
     """
 
     length: int = 1000
     scan_dtype: str = "uint16"
     rings: bool = True
     humans: bool = True
+    labels: bool = False
+    contact: bool = False
 
 
 class _Outputs:
@@ -63,6 +65,7 @@ class _Outputs:
         self.floats = np.zeros((n, length, _FLOATS), np.float32)
         self.ints = np.zeros((n, length, _INTS), np.int32)
         self.humans = np.zeros((n, length if settings.humans else 1, crowd, len(HUMAN_FIELDS)), np.float32)
+        self.labels = np.zeros((n, length if settings.labels else 1, config.sensor.n_rays), np.uint8)
         self.episodes = np.zeros((n, starts, 10))
         self.corners = np.zeros((n, starts * 4 * config.max_polygons, 2), np.float32)
         self.sizes = np.zeros((n, starts * config.max_polygons), np.int32)
@@ -93,6 +96,10 @@ def _columns(out: _Outputs, w: int, sequence: int, settings: RolloutSettings) ->
     }
     if settings.humans:
         columns["humans"] = out.humans[w]
+    if settings.labels:
+        columns["scan_label"] = out.labels[w]
+    if settings.contact:
+        columns["contact"] = ints[:, 3].astype(np.uint8)
     return columns
 
 
@@ -172,8 +179,8 @@ class ScriptedRollout:
         ))  # fmt: skip
         observe = (begin_row, (
             0, agents, scalars, *static, a.circles, a.dirs, a.inv_work, a.owner_work, a.hits[0], a.scans[0], a.params,
-            a.flags, out.scan[0], out.floats[0], out.ints[0], out.humans[0], out.episodes[0], out.corners[0],
-            out.sizes[0], out.table[0], out.counts[0],
+            a.flags, out.scan[0], out.floats[0], out.ints[0], out.humans[0], out.labels[0], out.episodes[0],
+            out.corners[0], out.sizes[0], out.table[0], out.counts[0],
         ))  # fmt: skip
         choose = (choose_actions, (
             agents, a.agents32, scalars, a.obst_f[0], a.obst_i[0], a.rng[0], a.params, a.flags, *orca, three, three,
@@ -197,13 +204,13 @@ class ScriptedRollout:
         """Return the rows of one sequence; the arrays are overwritten by the next call."""
         (sequence,) = sequences
         a, out = self.arrays, self._out
-        seed_worlds(a.rng, a.scalars, self.seed, sequence)
+        seed_worlds(a.rng, a.scalars, self.seed, np.array([sequence]))
         ok = rollout_sequence(
             a.agents[0], a.agents32, a.scalars[0], a.vertices[0], a.polygon_start[0], a.edges[0], a.obst_f[0],
             a.obst_i[0], a.boxes[0], a.rng[0], a.circles, a.dirs, a.inv_work, a.owner_work, a.hits[0], a.scans[0],
             a.work_f, a.work_i, a.moves, a.params, a.flags, a.orca_params,
-            out.scan[0], out.floats[0], out.ints[0], out.humans[0], out.episodes[0], out.corners[0], out.sizes[0],
-            out.table[0], out.counts[0],
+            out.scan[0], out.floats[0], out.ints[0], out.humans[0], out.labels[0], out.episodes[0], out.corners[0],
+            out.sizes[0], out.table[0], out.counts[0],
         )  # fmt: skip
         if not ok:
             raise _no_world(a.config, sequence)
@@ -244,14 +251,14 @@ class CallableRollout:
         self._out: _Outputs | None = None
 
     def run(self, sequences: Sequence[int]) -> list[SequenceRows]:
-        """Return the rows of consecutive sequences, in order; the arrays are overwritten by the next call."""
+        """Return the rows of these sequences, in order; the arrays are overwritten by the next call."""
         n = len(sequences)
         if self._arrays is None or self._out is None or self._arrays.agents.shape[0] != n:
             self._arrays = WorldArrays(self.config, n)
             self._out = _Outputs(self.config, self.settings, n)
             _prepare(self._arrays, self.settings)
         a, out = self._arrays, self._out
-        seed_worlds(a.rng, a.scalars, self.seed, sequences[0])
+        seed_worlds(a.rng, a.scalars, self.seed, np.array(sequences))
         out.counts[:] = 0
         everything = np.ones(n, np.bool_)
         if not reset_worlds(
@@ -270,7 +277,7 @@ class CallableRollout:
             begin_rows(
                 row, a.agents, a.scalars, a.vertices, a.polygon_start, a.edges, a.circles, a.dirs, a.inv_work,
                 a.owner_work, a.hits, a.scans, a.params, a.flags, out.scan, out.floats, out.ints, out.humans,
-                out.episodes, out.corners, out.sizes, out.table, out.counts,
+                out.labels, out.episodes, out.corners, out.sizes, out.table, out.counts,
             )  # fmt: skip
             first = out.ints[:, row, 2] == 0
             if reset is not None and row > 0 and first.any():
@@ -327,6 +334,7 @@ def _prepare(arrays: WorldArrays, settings: RolloutSettings) -> None:
     check_rings(arrays.config, settings.rings)
     arrays.flags[lay.F_SCAN_MM] = settings.scan_dtype == "uint16"
     arrays.flags[lay.F_WANT_HUMANS] = settings.humans
+    arrays.flags[lay.F_WANT_LABELS] = settings.labels
 
 
 def _no_world(config: SimConfig, sequence: int) -> SimulationError:

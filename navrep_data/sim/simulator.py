@@ -54,7 +54,7 @@ def _rows(name: str, values: ArrayLike, n: int, size: int) -> F64:
 
 def check_place(simulator: Simulator, world: int, where: F64) -> None:
     """Raise ConfigError unless the robot of a world can start and arrive there: x, y, heading, goal x, goal y."""
-    state, config = simulator.state(world), simulator.config
+    state, config, origin = simulator.state(world), simulator.config, simulator.origins[world]
     radius = float(state.robot[5])
     if state.step > 0:
         raise ConfigError(f"World {world} has had {state.step} steps, expected none: robots are placed after a reset.")
@@ -63,20 +63,21 @@ def check_place(simulator: Simulator, world: int, where: F64) -> None:
             "A goal was given, but scenarios have their own: give a start only, or an environment on maps without "
             "scenarios, such as map."
         )
-    for name, (x, y) in (("start", where[:2]), ("goal", where[3:])):
+    for name, place in (("start", where[:2]), ("goal", where[3:])):
         if simulator.maps is None:  # maps lie within these bounds
-            check_near_zero(f"The {name}", np.array([x, y]))
-        gap = float(simulator.clearance([[x, y]], world)[0])
+            check_near_zero(f"The {name}", place)
+        gap = float(simulator.clearance([place], world)[0])
+        x, y = place + origin
         if not gap >= radius - _TOUCHING:
             raise ConfigError(
                 f"The {name} ({x:g}, {y:g}) has {gap:.2f} m to the next obstacle, expected at least the robot's radius "
                 f"of {radius:.2f} m (negative: inside one, or outside of the world): choose a free place."
             )
+    x, y = where[:2] + origin
     near = np.hypot(*(state.humans[:, :2] - where[:2]).T) - state.humans[:, 7] - radius
     if len(near) and near.min() < 0.0:
         raise ConfigError(
-            f"The start ({where[0]:g}, {where[1]:g}) overlaps a human by {-near.min():.2f} m: choose a free place, or "
-            "another seed."
+            f"The start ({x:g}, {y:g}) overlaps a human by {-near.min():.2f} m: choose a free place, or another seed."
         )
     way, reach = float(np.hypot(*(where[3:] - where[:2]))), config.goal_radius or radius
     if way <= reach:
@@ -204,6 +205,9 @@ class Simulator:
     Worlds do not end by themselves: :meth:`step` reports events, the caller resets. An action is the body velocity
     command (vx, vy [m/s], omega [rad/s]) and is executed as given, but for what `drive` and `inertia` say.
 
+    Worlds of maps in `consistent` physics are simulated with (0, 0) at the map's lower left corner, wherever the map's
+    file puts that: the world frame of :meth:`state`. :attr:`origins` leads back to the file's frame.
+
     With several robots, arrays per robot have an axis of R robots after that of the W worlds. The episode is joint:
     one event per world, the highest ranking of its robots' (collision with an agent, with an obstacle, goal, timeout);
     a collision between robots counts as ``collision_human``, the code for collisions with agents.
@@ -215,7 +219,8 @@ class Simulator:
         self.n_worlds = n_worlds
         self.maps = MapWorlds(config, n_worlds) if config.world == "map" else None
         self.arrays: Any = WorldArrays(config, n_worlds) if self.maps is None else self.maps.arrays
-        _batch.seed_worlds(self.arrays.rng, self.arrays.scalars, check_seed(seed), check_seed(first_sequence))
+        sequences = check_seed(first_sequence) + np.arange(n_worlds)
+        _batch.seed_worlds(self.arrays.rng, self.arrays.scalars, check_seed(seed), sequences)
         self.reset()
 
     def reset(self, mask: ArrayLike | None = None) -> None:
@@ -309,15 +314,20 @@ class Simulator:
         _batch.seed_legacy(streams, np.where(chosen, seeds, 0).astype(np.uint64), chosen)
         return streams
 
+    @property
+    def origins(self) -> F64:
+        """Where the worlds' (0, 0) is in the frames of their map files, (W, 2) [m]; 0 where there is no such frame."""
+        return np.zeros((self.n_worlds, 2)) if self.maps is None else self.maps.origins()
+
     def place(self, starts: ArrayLike, goals: ArrayLike, mask: ArrayLike | None = None) -> None:
         """Put robots and their goals elsewhere, right after a reset; everything else stays as it was drawn.
 
         Parameters
         ----------
         starts : array_like of shape (W, 3)
-            x, y [m], heading [rad], world frame; NaN = as drawn (x and y together).
+            x, y [m], heading [rad], in the frame of :meth:`state`; NaN = as drawn (x and y together).
         goals : array_like of shape (W, 2)
-            x, y [m], world frame; NaN = as drawn.
+            x, y [m], in the frame of :meth:`state`; NaN = as drawn.
         mask : array_like of shape (W,), optional
             Which worlds.
 
@@ -326,7 +336,8 @@ class Simulator:
         ConfigError
             If there are several robots, a shape is wrong, an episode has had a step, a robot would not be free of
             obstacles and humans at its start or of obstacles at its goal, or would have arrived already; or if a
-            scenario, which has its goals worked out beforehand, is given another one. No robot is moved then.
+            scenario, which has its goals worked out beforehand, is given another one. No robot is moved then. Messages
+            name places in the frame of the map's file.
         """
         chosen = self._mask(mask)
         where = np.concatenate([_rows("starts", starts, self.n_worlds, 3), _rows("goals", goals, self.n_worlds, 2)], 1)

@@ -115,7 +115,7 @@ def encode_dataset(
                 for k, entry in enumerate(shards):
                     if k >= len(manifest.shards):
                         columns = _encode_shard(folder, k, vae, precision, device, bar)
-                        written = write_latent_shard(out, k, columns, entry.sequences)
+                        written = write_latent_shard(out, entry.file, entry.split, columns)
                         manifest = manifest.with_shard(written, complete=k + 1 == len(shards))
                         manifest.save(out)
                     else:
@@ -132,7 +132,6 @@ def _plan(folder: DatasetFolder, vae: VAE, name: str, precision: str) -> LatentM
         {"name": name, "weights_sha256": weights_hash(vae), "lidar": vae.config.lidar, "precision": precision},
         {**folder.provenance, "env": m.env, "physics": m.physics, "seed": m.seed, "rows": m.rows},
         m.sensor.to_dict(),
-        {split: [list(r) for r in ranges] for split, ranges in m.splits.items()},
     )
 
 
@@ -156,9 +155,7 @@ def _unfinished(out: Path, wanted: LatentManifest) -> LatentManifest:
         try:
             read_latent_shard(out, shard, found.z_size)
         except CorruptDataError:  # damaged since: made again, with those after it
-            return LatentManifest(
-                found.z_size, found.encoder, found.source, found.sensor, found.splits, found.shards[:k]
-            )
+            return LatentManifest(found.z_size, found.encoder, found.source, found.sensor, found.shards[:k])
     return found
 
 

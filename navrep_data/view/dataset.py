@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +115,7 @@ def dataset_page(
 
 def _choose(manifest: Manifest, sequences: Sequence[int] | None, root: Path) -> list[int]:
     """Return which sequences to show, checked."""
-    there = list(islice((k for s in manifest.shards for k in range(*s.sequences)), DEFAULT_SEQUENCES))
+    there = sorted(k for s in manifest.shards for k in s.numbers)
     if not there:
         raise ConfigError(f"{root} has no finished sequence yet; run its generate command again, then look at it.")
     if sequences is None:
@@ -128,15 +127,17 @@ def _choose(manifest: Manifest, sequences: Sequence[int] | None, root: Path) -> 
     if len(wanted) > MAX_SEQUENCES:
         raise ConfigError(f"{len(wanted)} sequences were asked for, expected at most {MAX_SEQUENCES} in one page.")
     for k in wanted:
-        if not any(s.sequences[0] <= k < s.sequences[1] for s in manifest.shards):
-            last = manifest.shards[-1].sequences[1] - 1
-            raise ConfigError(f"Sequence {k} is not in {root}; it has {there[0]} to {last}. Choose with --sequence.")
+        if manifest.place_of(k) is None:
+            raise ConfigError(
+                f"Sequence {k} is not in {root}; it has {len(there):,} from {there[0]} to {there[-1]}. Choose with "
+                "--sequence."
+            )
     return wanted
 
 
 def _read(folder: DatasetFolder, number: int, notes: list[str]) -> _Rows:
     """Return the rows of a sequence, as many as can be shown at all."""
-    index = next(k for k, s in enumerate(folder.manifest.shards) if s.sequences[0] <= number < s.sequences[1])
+    index = next(k for k, s in enumerate(folder.manifest.shards) if s.position(number) is not None)
     shard = folder.shard(index)
     mine = np.flatnonzero(shard.read("sequence", 0, shard.rows) == number)
     if not len(mine) or mine[-1] - mine[0] + 1 != len(mine):
@@ -182,6 +183,8 @@ def _pack(rows: _Rows, manifest: Manifest) -> tuple[dict[str, Any], str, list[st
         blob.add_codes("scan", scan, 0.0, SCAN_SCALE)
     else:
         blob.add("scan", scan, MILLIMETRE)
+    if "scan_label" in c:
+        blob.add_bytes("scan_label", c["scan_label"])
     if "rings" in c:
         blob.add_bytes("rings", pack_rings(c["rings"]))
     elif manifest.sensor.covers_full_turn():

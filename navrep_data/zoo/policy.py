@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import math
 from typing import Any, TypeVar
 
@@ -186,6 +187,20 @@ class Policy:
 
     def __repr__(self) -> str:
         return f"Policy({self.name!r}, lidar={self.lidar!r}, features={self.features!r}, inference={self.inference!r})"
+
+    def content_hash(self) -> str:
+        """Return a SHA-256 over the weights of all parts and what they are run with.
+
+        Two policies with the same one choose the same actions, up to rounding: datasets name their policy by it.
+        """
+        digest = hashlib.sha256(repr((
+            self.features, self.lidar, self.context, self.inference, self.seed, self.ranges, self.robot,
+            self.trained_on,
+        )).encode())  # fmt: skip
+        for part in (self.network, self.vae, self.world_model):
+            for name, tensor in sorted(part.state_dict().items()) if part is not None else ():
+                digest.update(f"{name} {tuple(tensor.shape)}".encode() + tensor.cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
 
     def for_robot(self, max_speed: float | None = None, radius: float | None = None) -> Policy:
         """Return this policy for a robot of another top speed or size, with a memory of its own.

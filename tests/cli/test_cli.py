@@ -28,7 +28,7 @@ def test_generate_tells_plan_outcome_and_what_to_do_next(dataset):
     root, out = dataset
     lines = out.splitlines()
     assert any(line.startswith("4 sequences x 20 steps = 80 rows, about ") for line in lines)
-    assert any("80 rows, 1 shards" in line for line in lines)
+    assert any("80 rows, 3 shards" in line for line in lines)
     assert lines[-1] == f"next: navrep-data info {root}"
 
 
@@ -51,7 +51,7 @@ def test_default_folder_is_data_env(tmp_path):
 def test_info(dataset):
     text = run("info", dataset[0]).stdout
     assert "soadrl, consistent physics, seed 0 (complete)" in text
-    assert "4 sequences, 80 rows in 1 shards" in text
+    assert "4 sequences, 80 rows in 3 shards" in text
     found = json.loads(run("info", dataset[0], "--json").stdout)
     assert found["rows"] == 80
     assert found["splits"] == {"train": 2, "val": 1, "test": 1}
@@ -65,13 +65,13 @@ def test_verify_finds_a_flipped_byte(dataset, tmp_path):
     assert done.returncode == 0
     assert "all well" in done.stdout
     shutil.copytree(dataset[0], tmp_path / "d")
-    shard = tmp_path / "d" / "data" / "shard-00000.h5"
+    shard = tmp_path / "d" / "data" / "train-00000.h5"
     data = bytearray(shard.read_bytes())
     data[5000] ^= 8
     shard.write_bytes(data)
     done = run("verify", tmp_path / "d")
     assert done.returncode == 2
-    assert "data/shard-00000.h5" in done.stdout
+    assert "data/train-00000.h5" in done.stdout
     assert not json.loads(run("verify", tmp_path / "d", "--json").stdout)["ok"]
 
 

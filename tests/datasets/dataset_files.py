@@ -8,7 +8,7 @@ import numpy as np
 
 from navrep_data.observations import scan_to_rings
 from navrep_data.schema import COLUMNS, Event, SensorContract
-from navrep_data.shards import Manifest, ShardWriter, publish
+from navrep_data.shards import DatasetWriter, Manifest, split_of
 
 N_RAYS = 1080
 H = 3
@@ -45,6 +45,7 @@ def make_sequence(
     values = {
         "scan": scan,
         "rings": scan_to_rings(scan),
+        "scan_label": rng.integers(0, 3 + H, scan.shape),
         "robot_state": state,
         "action": action,
         "reward": reward,
@@ -52,6 +53,7 @@ def make_sequence(
         "is_last": is_last,
         "is_terminal": np.isin(event, [e for e in Event if e.terminal]),
         "event": event,
+        "contact": rng.integers(0, 4, n) * ~is_last,
         "sequence": np.full(n, sequence),
         "episode": episode,
         "step": step,
@@ -81,25 +83,7 @@ def write_dataset(
     columns = tuple(name for name in COLUMNS if name not in without)
     length = max(sum(lengths) for lengths in sequences)
     sensor = SensorContract()
-    for folder in ("data", "worlds"):
-        (root / folder).mkdir(parents=True)
-    shards, contents = [], []
-    for first in range(0, len(sequences), shard_size):
-        writer = ShardWriter(
-            env="test",
-            config={},
-            seed=0,
-            sensor=sensor,
-            scan_dtype=scan_dtype,
-            columns=columns,
-            max_humans=H,
-            length=length,
-            first_sequence=first,
-        )
-        for k in range(first, min(first + shard_size, len(sequences))):
-            contents.append(make_sequence(k, sequences[k], columns, scan_dtype, nan_goals))
-            writer.append(contents[-1])
-        shards.append(publish(root, len(shards), writer.finish()))
+    root.mkdir(parents=True)
     manifest = Manifest(
         env="test",
         physics="consistent",
@@ -115,7 +99,11 @@ def write_dataset(
         policy={},
         versions={},
     )
-    manifest.with_shards(shards, complete=True).save(root)
+    writer, contents = DatasetWriter(root, manifest), []
+    for k, lengths in enumerate(sequences):
+        contents.append(make_sequence(k, lengths, columns, scan_dtype, nan_goals))
+        writer.append(k, split_of(k), contents[-1])
+    writer.finish()
     return contents
 
 

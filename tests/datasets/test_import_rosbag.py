@@ -30,10 +30,12 @@ def rows_of(root):
     """Columns of the whole dataset, put end to end."""
     with DatasetFolder(root) as folder:
         shards = range(len(folder.manifest.shards))
-        return {
+        found = {
             c: np.concatenate([folder.read(c, k, 0, folder.manifest.shards[k].rows) for k in shards])
             for c in folder.manifest.columns
         }
+    order = np.argsort(found["sequence"], kind="stable")
+    return {name: values[order] for name, values in found.items()}
 
 
 @pytest.mark.slow
@@ -48,12 +50,12 @@ def test_poses_far_from_the_origin_are_stored_near_it_and_said_to_be(tmp_path, m
     monkeypatch.setattr(Recorder, "odometry", far)
     said = []
     moved = rows_of_import(tmp_path, "far", note=said.append)
-    assert any("stored less (456000, 5428001) m, which the manifest holds as pose_origin" in line for line in said)
+    assert any("stored less (456000, 5428001) m, which the manifest holds under origins" in line for line in said)
     np.testing.assert_allclose(moved["robot_pose"] + [0, 1, 0], plain["robot_pose"], atol=1e-6)
     with DatasetFolder(tmp_path / "far") as folder:
-        assert folder.manifest.config["pose_origin"] == [456000.0, 5428001.0]
+        assert folder.manifest.origins == {"recording": (456000.0, 5428001.0)}
     with DatasetFolder(tmp_path / "plain") as folder:
-        assert "pose_origin" not in folder.manifest.config
+        assert folder.manifest.origins == {}
 
 
 def rows_of_import(tmp_path, name, **settings):

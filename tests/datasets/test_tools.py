@@ -26,7 +26,7 @@ from navrep_data.errors import (
 )
 from navrep_data.generate import generate, regenerate
 from navrep_data.schema import EVENT_NAMES, Event
-from navrep_data.shards import DatasetFolder, Manifest, SequenceSource, info, select_shards, verify
+from navrep_data.shards import DatasetFolder, Manifest, SequenceSource, dataset_writer, info, select_shards, verify
 from navrep_data.testing import tiny_dataset
 from navrep_data.view import dataset_page
 
@@ -35,7 +35,7 @@ ROWS = 240
 
 @pytest.fixture(scope="module")
 def few(tmp_path_factory):
-    """Five sequences in three shards, small crowds."""
+    """Five sequences in four shards, small crowds: 0, 3 and 4 for training, 1 and 2."""
     return tiny_dataset(tmp_path_factory.mktemp("few") / "few", n=5, length=ROWS, humans=4)
 
 
@@ -52,20 +52,26 @@ def contents(root):
         for k, entry in enumerate(folder.manifest.shards):
             sequence = folder.read("sequence", k, 0, entry.rows)
             worlds = folder.worlds(k)
-            for number in range(*entry.sequences):
+            for number in entry.numbers:
                 rows = np.flatnonzero(sequence == number)
                 columns = {c: folder.read(c, k, rows[0], rows[-1] + 1) for c in folder.manifest.columns}
                 there = [worlds.episode(i) for i in range(len(worlds))] if worlds else []
-                result.append((columns, [w for w in there if w.sequence == number]))
-    return result
+                result.append((number, columns, [w for w in there if w.sequence == number]))
+    return [(columns, worlds) for _, columns, worlds in sorted(result, key=lambda one: one[0])]
+
+
+def by_number(root, name):
+    """What the entries of the shards say of each sequence, in the order of their numbers."""
+    listed = [one for s in Manifest.read(root).shards for one in zip(s.numbers, getattr(s, name), strict=True)]
+    return [value for _, value in sorted(listed, key=lambda one: one[0])]
 
 
 def sources(root) -> list[SequenceSource]:
-    return [one for shard in Manifest.read(root).shards for one in shard.source]
+    return by_number(root, "source")
 
 
 def hashes(root):
-    return [h for shard in Manifest.read(root).shards for h in shard.sequence_hashes]
+    return by_number(root, "sequence_hashes")
 
 
 def tree(folder):
@@ -338,8 +344,8 @@ def test_a_failure_leaves_everything_as_it_was(few, many, tmp_path, monkeypatch,
             raise OSError(5, "the disk is gone")
         return entry
 
-    _pieces_publish = _pieces.publish
-    monkeypatch.setattr(_pieces, "publish", broken)
+    _pieces_publish = dataset_writer.publish
+    monkeypatch.setattr(dataset_writer, "publish", broken)
     monkeypatch.setattr(_pieces, "TARGET_SHARD_ROWS", 2 * ROWS)
     with pytest.raises(OSError, match="the disk is gone"):
         run()
@@ -352,7 +358,7 @@ def test_a_failure_leaves_everything_as_it_was(few, many, tmp_path, monkeypatch,
 
 
 def test_damage_does_not_get_a_right_hash(few, tmp_path):
-    for name in ("data/shard-00001.h5", "worlds/shard-00001.npz"):
+    for name in ("data/train-00001.h5", "worlds/train-00001.npz"):
         root = tmp_path / "d"
         shutil.copytree(few, root)
         data = bytearray((root / name).read_bytes())
@@ -456,12 +462,12 @@ def test_parts_are_tools_food_and_parts_of_results_know_their_source(few, many, 
     part = shutil.copytree(few, tmp_path / "part")
     select_shards(Manifest.read(few), [1]).save(part)
     (part / "README.md").unlink()
-    for k in (0, 2):
-        (part / f"data/shard-0000{k}.h5").unlink()
-        (part / f"worlds/shard-0000{k}.npz").unlink()
+    for name in ("train-00000", "val-00000", "test-00000"):
+        (part / f"data/{name}.h5").unlink()
+        (part / f"worlds/{name}.npz").unlink()
     merge([part, many], tmp_path / "out")
     assert verify(tmp_path / "out").ok
-    assert [s.sequence for s in sources(tmp_path / "out")] == [2, 3, 0, 1, 2]
+    assert [s.sequence for s in sources(tmp_path / "out")] == [4, 0, 1, 2]
     # a sequence is the same one in the part and in the whole
     with pytest.raises(DatasetMismatchError, match="is both in"):
         merge([tmp_path / "out", few], tmp_path / "twice")
@@ -514,7 +520,7 @@ def test_generate_leaves_results_alone(few, tmp_path):
 def test_shards_are_neither_tiny_nor_too_large(few, tmp_path, monkeypatch):
     monkeypatch.setattr(_pieces, "TARGET_SHARD_ROWS", 2 * ROWS)
     manifest = filter(few, tmp_path / "out", min_steps=1)
-    per_shard = [s.sequences[1] - s.sequences[0] for s in manifest.shards]
+    per_shard = [s.count for s in manifest.shards if s.split == "train"]
     assert set(per_shard[:-1]) == {manifest.shard_size}
     assert max(s.rows for s in manifest.shards) < 4 * ROWS
     monkeypatch.setattr(_pieces, "MAX_SHARD_BYTES", 1000)

@@ -11,7 +11,7 @@ from navrep_data.errors import DatasetNotFoundError
 from navrep_data.generate import generate
 from navrep_data.observations import scan_to_rings
 from navrep_data.schema import Event
-from navrep_data.shards import DatasetFolder, ShardWriter, dataset_card, publish, verify
+from navrep_data.shards import DatasetFolder, DatasetWriter, verify
 
 LENGTH = 150
 
@@ -24,29 +24,26 @@ def sound(tmp_path_factory):
     return root
 
 
-def rebuilt(sound, out, change, **settings):
-    """Write the dataset again with `change(k, columns, worlds)` applied, hashes and all."""
-    entries = []
+def rebuilt(sound, out, change, splits=None, **settings):
+    """Write the dataset again with `change(k, columns, worlds)` applied to sequence k, hashes and all."""
+    from dataclasses import replace
+
+    writer = None
     with DatasetFolder(sound) as folder:
         old = folder.manifest
         for k in range(3):
-            shard = folder.shard(k)
+            place, _ = old.place_of(k)
+            shard = folder.shard(place)
             columns = {name: shard.read(name, 0, shard.rows) for name in old.columns}
-            worlds = {name: values.copy() for name, values in folder.worlds(k).arrays.items()}
+            worlds = {name: values.copy() for name, values in folder.worlds(place).arrays.items()}
             worlds = change(k, columns, worlds) or worlds
             names = [name for name in old.columns if name in columns]
-            writer = ShardWriter(
-                env=old.env, config=settings.get("config", old.config), seed=old.seed,
-                sensor=settings.get("sensor", old.sensor),
-                scan_dtype=old.scan_dtype, columns=names, max_humans=old.max_humans, length=LENGTH, first_sequence=k,
-            )  # fmt: skip
-            writer.append(columns, worlds)
-            out.mkdir(exist_ok=True)
-            entries.append(publish(out, k, writer.finish()))
-        from dataclasses import replace
-
-        new = replace(old, columns=tuple(names), **settings).with_shards(entries, complete=True)
-        new.save(out, dataset_card(new))
+            if writer is None:
+                out.mkdir()
+                rule = old.split_rule if splits is None else "as the test wants"
+                writer = DatasetWriter(out, replace(old, columns=tuple(names), split_rule=rule, **settings))
+            writer.append(k, (splits or ("train", "val", "test"))[k], columns, worlds)
+    writer.finish()
     assert verify(out).ok
     return out
 
@@ -92,12 +89,7 @@ def test_doubled_rows_in_one_split_are_a_note(sound, tmp_path):
             return {**change.kept[1], "sequence": np.full_like(change.kept[1]["sequence"], 1)}
         return None
 
-    root = rebuilt(sound, tmp_path / "d", change)
-    with DatasetFolder(root) as folder:
-        manifest = folder.manifest.with_shards(
-            folder.manifest.shards, complete=True, splits={"train": ((0, 2),), "val": ((2, 3),)}
-        )
-    manifest.save(root, dataset_card(manifest))
+    root = rebuilt(sound, tmp_path / "d", change, splits=("train", "train", "val"))
     report = check_dataset(root)
     assert report.ok
     assert {f.check for f in report.findings} == {"duplicates"}
@@ -237,12 +229,12 @@ def test_damage_is_told_and_the_rest_still_checked(sound, tmp_path):
 
     root = tmp_path / "d"
     shutil.copytree(sound, root)
-    path = root / "data/shard-00001.h5"
+    path = root / "data/val-00000.h5"
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
     report = check_dataset(root)
-    assert [(f.check, f.where) for f in report.findings] == [("verify", "data/shard-00001.h5")]
+    assert [(f.check, f.where) for f in report.findings] == [("verify", "data/val-00000.h5")]
     assert report.sequences == 2
 
 

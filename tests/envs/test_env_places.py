@@ -21,6 +21,7 @@ def test_the_robot_starts_there_and_wants_to_go_there(env, physics):
     goal = state.robot[3:5] + 0.1 * (state.robot[:2] - state.robot[3:5]) / np.linalg.norm(
         state.robot[:2] - state.robot[3:5]
     )
+    goal += plain.unwrapped._worlds.sim.origins[0]
     observation, info = world.reset(seed=5, options={"start": start, "goal": goal})
     np.testing.assert_allclose(info["robot"], start)
     assert same(info["humans"], before["humans"])

@@ -97,9 +97,10 @@ def test_info_says_where_everybody_is(env, physics):
     _, info = world.reset(seed=7)
     for step in range(12):
         state = world._worlds.sim.state()
-        robots = state.robots[:, :3]
+        at = world._worlds.sim.origins[0]  # maps in consistent physics are simulated elsewhere than their files say
+        robots = state.robots[:, :3] + [*at, 0.0]
         np.testing.assert_array_equal(info["robot"], robots if len(robots) > 1 else robots[0])
-        np.testing.assert_array_equal(info["humans"], state.humans[:, :4])
+        np.testing.assert_array_equal(info["humans"], state.humans[:, :4] + [*at, 0.0, 0.0])
         assert info["event"] == "none", step
         observation, _, terminated, truncated, info = world.step(np.zeros(world.action_space.shape))
         assert observation in world.observation_space

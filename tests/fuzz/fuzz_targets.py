@@ -83,7 +83,7 @@ def _simulated() -> Files:
     from navrep_data.testing import tiny_dataset
 
     with tempfile.TemporaryDirectory() as name:
-        root = tiny_dataset(Path(name) / "tiny", n=2, length=24, humans=2, obstacles=1)
+        root = tiny_dataset(Path(name) / "tiny", n=4, length=24, humans=2, obstacles=1)
         return {
             name: data
             for name, data in load_files(root).items()
@@ -165,7 +165,7 @@ def _read_shard(folder: Path) -> None:
 
 
 def _make_shard(folder: Path) -> None:
-    (folder / "shard.h5").write_bytes(_simulated()["data/shard-00000.h5"])
+    (folder / "shard.h5").write_bytes(_simulated()["data/train-00000.h5"])
 
 
 def _make_float_shard(folder: Path) -> None:
@@ -173,7 +173,7 @@ def _make_float_shard(folder: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
         _make_npz(Path(name))
         _read_npz(Path(name))
-        (folder / "shard.h5").write_bytes((Path(name) / "out/data/shard-00000.h5").read_bytes())
+        (folder / "shard.h5").write_bytes((Path(name) / "out/data/train-00000.h5").read_bytes())
 
 
 def _make_h5py_shard(folder: Path) -> None:
@@ -195,7 +195,7 @@ def _make_h5py_shard(folder: Path) -> None:
 
 
 def _make_worlds(folder: Path) -> None:
-    (folder / "worlds.npz").write_bytes(_simulated()["worlds/shard-00000.npz"])
+    (folder / "worlds.npz").write_bytes(_simulated()["worlds/train-00000.npz"])
 
 
 def _read_worlds(folder: Path) -> None:
@@ -426,8 +426,8 @@ def _make_latents(folder: Path) -> None:
         "is_terminal": np.zeros(rows, bool), "event": np.zeros(rows), "sequence": np.zeros(rows),
         "episode": np.arange(rows) // 10, "step": np.arange(rows) % 10,
     }  # fmt: skip
-    shard = write_latent_shard(folder, 0, columns, (0, 1))
-    manifest = LatentManifest(z, {"name": "v"}, {"name": "d"}, SensorContract().to_dict(), {"train": [[0, 1]]})
+    shard = write_latent_shard(folder, "data/train-00000.h5", "train", columns)
+    manifest = LatentManifest(z, {"name": "v"}, {"name": "d"}, SensorContract().to_dict())
     manifest.with_shard(shard, True).save(folder)
 
 

@@ -137,9 +137,9 @@ def test_results_with_numbers_too_large_or_settings_that_are_none(files, change)
 
 
 @of("latents")
-def test_codes_whose_splits_are_no_object(files):
+def test_codes_whose_split_is_no_split(files):
     values = json.loads((files / "manifest.json").read_bytes())
-    values["splits"] = [1]
+    values["shards"][0]["split"] = [1]
     (files / "manifest.json").write_text(json.dumps(values))
     target = BY_NAME["latents"]
     for name, data in target.seal(load_files(files)).items():

@@ -48,7 +48,7 @@ def tree(root):
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory):
-    """Seven sequences in four shards, made in one go by one process."""
+    """Seven sequences in five shards, made in one go: 0, 3 and 4, 5 and 6 for training, 1 val, 2 test."""
     root = tmp_path_factory.mktemp("reference") / "d"
     result = generate(n=7, out=root, **SMALL)
     return root, result, tree(root)
@@ -56,13 +56,14 @@ def reference(tmp_path_factory):
 
 def test_result_and_files(reference):
     root, result, files = reference
-    assert (result.rows, result.sequences, result.shards, result.new_rows) == (210, 7, 4, 210)
+    assert (result.rows, result.sequences, result.shards, result.new_rows) == (210, 7, 5, 210)
     assert result.bytes == sum(p.stat().st_size for p in root.rglob("*.h5")) + sum(
         p.stat().st_size for p in root.rglob("*.npz")
     )
     assert sum(result.outcomes.values()) >= 7
     expected = {"README.md", "manifest.json"}
-    expected |= {f"data/shard-{k:05d}.h5" for k in range(4)} | {f"worlds/shard-{k:05d}.npz" for k in range(4)}
+    names = [*(f"train-{k:05d}" for k in range(3)), "val-00000", "test-00000"]
+    expected |= {f"data/{name}.h5" for name in names} | {f"worlds/{name}.npz" for name in names}
     assert set(files) == expected
     manifest = json.loads((root / "manifest.json").read_text())
     for shard in manifest["shards"]:
@@ -138,7 +139,7 @@ def test_an_interrupted_run_goes_on(reference, tmp_path, monkeypatch, stop_after
 def test_a_damaged_shard_is_made_again(reference, tmp_path, harm):
     root = tmp_path / "d"
     shutil.copytree(reference[0], root)
-    path = root / ("worlds/shard-00001.npz" if harm == "worlds" else "data/shard-00001.h5")
+    path = root / ("worlds/train-00001.npz" if harm == "worlds" else "data/train-00001.h5")
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     if harm == "delete":
@@ -147,7 +148,7 @@ def test_a_damaged_shard_is_made_again(reference, tmp_path, harm):
         path.write_bytes(data[: len(data) // 2] if harm == "truncate" else data)
     lines = []
     generate(n=7, out=root, report=lines.append, **SMALL)
-    assert any("shard-00001" in line and "making it again" in line for line in lines)
+    assert any("train-00001" in line and "making it again" in line for line in lines)
     assert tree(root) == reference[2]
 
 
@@ -158,7 +159,7 @@ def test_a_cut_manifest_is_made_again(reference, tmp_path, cut):
     shutil.copytree(reference[0], root)
     manifest = root / "manifest.json"
     manifest.write_bytes(manifest.read_bytes()[:cut])
-    (root / "data" / "shard-00003.h5").write_bytes(b"\x89HDF")
+    (root / "data" / "val-00000.h5").write_bytes(b"\x89HDF")
     lines = []
     generate(n=7, out=root, report=lines.append, **SMALL)
     assert "manifest.json is damaged; making the dataset again." in lines
@@ -178,9 +179,9 @@ def test_a_cut_manifest_over_other_data_is_refused(reference, tmp_path):
 def test_leftovers_of_a_killed_run_disappear(reference, tmp_path):
     root = tmp_path / "d"
     shutil.copytree(reference[0], root)
-    (root / "data" / ".shard-00009.h5.123.part").write_bytes(b"x" * 100)
+    (root / "data" / ".train-00009.h5.123.part").write_bytes(b"x" * 100)
     (root / ".staging" / "data").mkdir(parents=True)
-    (root / ".staging" / "data" / "shard-00003.h5").write_bytes(b"x")
+    (root / ".staging" / "data" / "train-00003.h5").write_bytes(b"x")
     generate(n=7, out=root, **SMALL)
     assert tree(root) == reference[2]
 
@@ -191,9 +192,9 @@ def test_leftovers_of_workers_killed_in_this_run_disappear(reference, tmp_path):
     def leave_a_temp_file(line):  # the plan is said once the leftovers of earlier runs are gone
         if " rows, about " in line:
             (root / "data").mkdir(parents=True)
-            (root / "data" / ".shard-00002.h5.123.part").write_bytes(b"x" * 100)
+            (root / "data" / ".train-00002.h5.123.part").write_bytes(b"x" * 100)
             (root / "worlds").mkdir()
-            (root / "worlds" / ".shard-00002.npz.123.part").write_bytes(b"x")
+            (root / "worlds" / ".train-00002.npz.123.part").write_bytes(b"x")
 
     generate(n=7, out=root, report=leave_a_temp_file, **SMALL)
     assert tree(root) == reference[2]
@@ -248,7 +249,7 @@ def test_shard_size_need_not_be_repeated(tmp_path):
     settings = {**SMALL, "n": 5, "out": tmp_path / "d"}
     generate(**settings)
     del settings["shard_size"]
-    assert generate(**{**settings, "n": 6}).shards == 3
+    assert generate(**{**settings, "n": 6}).shards == 4
 
 
 def test_a_folder_with_something_else_is_left_alone(tmp_path):
@@ -302,7 +303,7 @@ def test_a_manifest_too_large_to_be_read_is_said_before_anything_is_made(tmp_pat
 
 def test_manifests_are_no_larger_than_planned(reference):
     shards = json.loads((reference[0] / "manifest.json").read_text())["shards"]
-    per_shard = len(json_bytes({"shards": shards})) / 4
+    per_shard = len(json_bytes({"shards": shards})) / 5
     assert 0.5 < per_shard / (plan._MANIFEST_SHARD_BYTES + 2 * plan._MANIFEST_SEQUENCE_BYTES) < 1
 
 

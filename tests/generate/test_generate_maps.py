@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from navrep_data.errors import MissingExtraError
+from navrep_data.errors import DatasetMismatchError, MissingExtraError
 from navrep_data.generate import generate, regenerate
 from navrep_data.shards import Manifest, read_worlds, verify
 from navrep_data.sim import environment_names, load_map, make_config, map_names
@@ -58,6 +58,24 @@ def test_dataset_on_an_own_map(hall: str, tmp_path: Path, policy: object) -> Non
     if not callable(policy):
         report = regenerate(root, 2)
         assert [found.verdict for found in report.comparisons] == ["equal bytes"] * 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("origin", [(-6.0, -4.5), (456000.25, 5428000.5)])
+def test_rows_do_not_depend_on_where_the_map_lies(hall: str, origin: tuple[float, float], tmp_path: Path) -> None:
+    kwargs = {"env": "map", "humans": 3, "length": 40, "n": 3, "seed": 3}
+    generate(out=tmp_path / "a", maps=[hall], **kwargs)
+    path = Path(hall) / "hall.yaml"
+    path.write_text(path.read_text().replace("[0, 0, 0]", str([*origin, 0])))
+    generate(out=tmp_path / "b", maps=[hall], **kwargs)
+    made, moved = (Manifest.read(tmp_path / name) for name in "ab")
+    assert moved.inputs == made.inputs
+    assert (made.origins, moved.origins) == ({}, {f"map:{hall}": origin})
+    assert [s.sha256 for s in moved.shards] == [s.sha256 for s in made.shards]
+    assert [s.worlds.sha256 for s in moved.shards] == [s.worlds.sha256 for s in made.shards]
+    with pytest.raises(DatasetMismatchError, match=r"origin of map .* at None, which .* puts at"):
+        generate(out=tmp_path / "a", maps=[hall], **{**kwargs, "n": 4})
+    assert [one.verdict for one in regenerate(tmp_path / "a", 3).comparisons] == ["equal bytes"] * 3
 
 
 @pytest.mark.slow

@@ -86,7 +86,7 @@ def cut_last_files(root, rng):
         if rng.random() < 0.5:
             path.write_bytes(path.read_bytes()[: rng.randrange(path.stat().st_size + 1)])
     (root / "data").mkdir(exist_ok=True)
-    (root / "data" / f".shard-00000.h5.{rng.randrange(9999)}.part").write_bytes(b"half")
+    (root / "data" / f".train-00000.h5.{rng.randrange(9999)}.part").write_bytes(b"half")
 
 
 @pytest.mark.slow

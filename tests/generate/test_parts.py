@@ -42,12 +42,12 @@ def whole(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def three_parts(tmp_path_factory):
-    """A folder with the three parts of the same dataset, not merged: of one, one and two shards."""
+    """A folder with the three parts of the same dataset, not merged: of one, two and two shards."""
     root = tmp_path_factory.mktemp("parts") / "d"
     for k in (2, 0, 1):
         result = generate(out=root, shard_range=f"{k}/3", **SMALL)
         assert result.part == f"{k}/3"
-        assert result.shards == [1, 1, 2][k]
+        assert result.shards == [1, 2, 2][k]
         assert not (root / "manifest.json").exists()
     return root
 
@@ -60,7 +60,7 @@ def root(three_parts, tmp_path):
 def test_every_shard_is_in_one_part():
     for total in (0, 1, 4, 7, 100):
         for count in (1, 2, 3, 7, 11):
-            shares = [Part(k, count).shards(total) for k in range(count)]
+            shares = [Part(k, count).share(list(range(total))) for k in range(count)]
             assert [s for share in shares for s in share] == list(range(total))
             assert max(map(len, shares)) - min(map(len, shares)) <= 1
 
@@ -103,7 +103,7 @@ def test_a_merged_dataset_can_be_extended(root, tmp_path):
 @pytest.mark.slow
 def test_more_jobs_than_shards(tmp_path, whole):
     results = [generate(out=tmp_path / "d", shard_range=f"{k}/6", **SMALL) for k in range(6)]
-    assert sorted(r.shards for r in results) == [0, 0, 1, 1, 1, 1]
+    assert sorted(r.shards for r in results) == [0, 1, 1, 1, 1, 1]
     merge_manifest(tmp_path / "d")
     assert tree(tmp_path / "d") == whole
 
@@ -123,13 +123,13 @@ def test_an_interrupted_job_goes_on_and_removes_only_its_own_leftovers(tmp_path,
     with pytest.raises(KeyboardInterrupt):
         generate(out=root, shard_range="1/2", **SMALL)
     monkeypatch.setattr(executors, "make_shard", real)
-    mine, others = root / "data" / ".shard-00003.h5.1.part", root / "data" / ".shard-00000.h5.1.part"
+    mine, others = root / "data" / ".test-00000.h5.1.part", root / "data" / ".train-00000.h5.1.part"
     mine.touch()
     others.touch()
-    with pytest.raises(DatasetNotFoundError, match=r"Unfinished parts: 0/2 \(no manifest\), 1/2 \(1 of 2 shards\)"):
+    with pytest.raises(DatasetNotFoundError, match=r"Unfinished parts: 0/2 \(no manifest\), 1/2 \(1 of 3 shards\)"):
         merge_manifest(root)
     result = generate(out=root, shard_range="1/2", **SMALL)
-    assert (result.shards, result.new_rows) == (2, 30)
+    assert (result.shards, result.new_rows) == (3, 60)
     assert (mine.exists(), others.exists()) == (False, True)  # another job may be writing that one just now
     generate(out=root, shard_range="0/2", **SMALL)
     assert not others.exists()
@@ -195,14 +195,14 @@ def test_overlapping_parts_are_refused(root):
     shutil.rmtree(root / Part(0, 2).folder)
     first, second = (root / Part(k, 3).folder for k in (0, 1))
     Manifest.read(second).with_shards(Manifest.read(first).shards, complete=False).save(second)
-    with pytest.raises(DatasetMismatchError, match=r"Part 1/3 lists sequences \(0, 2\), which are not its own"):
+    with pytest.raises(DatasetMismatchError, match=r"Part 1/3 lists data/train-00000\.h5, which is not its own"):
         merge_manifest(root)
 
 
 def test_a_listed_file_must_be_there(root, whole):
-    path = root / "data" / "shard-00001.h5"
+    path = root / "data" / "train-00001.h5"
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(DatasetError, match=r"shard-00001\.h5 is missing or has another size"):
+    with pytest.raises(DatasetError, match=r"train-00001\.h5 is missing or has another size"):
         merge_manifest(root)
     generate(out=root, shard_range="1/3", **SMALL)  # as the message says
     merge_manifest(root)
@@ -263,7 +263,7 @@ def test_from_the_command_line_at_the_same_time(tmp_path, whole):
         assert "merge-manifest d" in text
     done = subprocess.run([*words, "merge-manifest", "d"], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "7 sequences, 210 rows, 4 shards" in done.stdout
+    assert "7 sequences, 210 rows, 5 shards" in done.stdout
     assert tree(tmp_path / "d") == whole
     shutil.rmtree(tmp_path / "d")
     done = subprocess.run([*words, "merge-manifest", "d"], cwd=tmp_path, capture_output=True, text=True)

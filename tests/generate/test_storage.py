@@ -65,8 +65,8 @@ def test_interrupted_and_extended(tmp_path, url, whole, monkeypatch):
         generate(n=5, out=tmp_path / "d", storage=url, **SMALL)
     monkeypatch.setattr(executors, "make_shard", real)
     assert "manifest.json" not in remote(url)  # nothing there calls itself a dataset yet
-    assert generate(n=5, out=tmp_path / "d", storage=url, **SMALL).new_rows == 30
-    # the last shard grows from one sequence to two: it is made aside, then moved over the old one
+    assert generate(n=5, out=tmp_path / "d", storage=url, **SMALL).new_rows == 60
+    # the last shard for training grows from one sequence to two: it is made aside, then moved over the old one
     assert generate(n=7, out=tmp_path / "d", storage=url, **SMALL).new_rows == 60
     assert remote(url) == whole
 
@@ -75,10 +75,10 @@ def test_interrupted_and_extended(tmp_path, url, whole, monkeypatch):
 def test_what_is_lost_there_is_made_again(tmp_path, url, whole):
     generate(n=7, out=tmp_path / "d", storage=url, **SMALL)
     fs, base = fsspec.core.url_to_fs(url)
-    fs.rm(f"{base}/data/shard-00001.h5")
-    fs.pipe_file(f"{base}/worlds/shard-00002.npz", b"cut")
+    fs.rm(f"{base}/data/train-00001.h5")
+    fs.pipe_file(f"{base}/worlds/val-00000.npz", b"cut")
     lines = []
-    assert generate(n=7, out=tmp_path / "d", storage=url, report=lines.append, **SMALL).new_rows == 120
+    assert generate(n=7, out=tmp_path / "d", storage=url, report=lines.append, **SMALL).new_rows == 90
     assert [line for line in lines if "making it again" in line]
     assert remote(url) == whole
 
@@ -124,7 +124,7 @@ def test_places_that_cannot_be_used(tmp_path, url, error, message):
 
 def test_a_place_that_refuses_is_one_line(tmp_path):
     (tmp_path / "file").write_text("not a folder")
-    with pytest.raises(FolderNotWritableError, match=r"Cannot write worlds/shard-00000\.npz to file://"):
+    with pytest.raises(FolderNotWritableError, match=r"Cannot write worlds/train-00000\.npz to file://"):
         generate(n=2, out=tmp_path / "d", storage=f"file://{tmp_path}/file/d", **SMALL)
 
 

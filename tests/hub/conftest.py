@@ -80,5 +80,5 @@ def no_pictures(monkeypatch):
 def template(tmp_path_factory) -> Path:
     """Six sequences in three shards, which no test may change."""
     root = tmp_path_factory.mktemp("hub") / "soadrl"
-    make_dataset(root, 6, 2, 40)
+    make_dataset(root, 4, 2, 60, by_rule=True)
     return root

@@ -137,7 +137,7 @@ def test_a_smaller_version_leaves_nothing_behind_and_spares_what_is_not_ours(hub
     make_dataset(tmp_path / "small", 2, 2, 40)
     push(tmp_path / "small", REPO, license="mit")
     names = set(repo.files())
-    assert {n for n in names if n.endswith((".h5", ".npz"))} == {"data/shard-00000.h5", "worlds/shard-00000.npz"}
+    assert {n for n in names if n.endswith((".h5", ".npz"))} == {"data/train-00000.h5", "worlds/train-00000.npz"}
     assert {"notes.md", "data/mine.txt"} <= names
     assert pull(REPO, tmp_path / "got").complete
 
@@ -177,10 +177,10 @@ def test_parts_add_up(hub, pushed, template, tmp_path):
     assert (part.shards, part.shards_in_all, part.complete) == (1, 3, False)
     assert verify(root).problems == []
     told = info(root)
-    assert (told["complete"], told["sequences"], told["partial"]["sequences"]) == (False, 2, 6)
+    assert (told["complete"], told["sequences"], told["partial"]["sequences"]) == (False, 1, 4)
     with DatasetFolder(root) as folder:
-        assert set(folder.episodes.sequence.tolist()) == {2, 3}
-    more = pull(REPO, root, split="val")
+        assert set(folder.episodes.sequence.tolist()) == {1}
+    more = pull(REPO, root, split="train")
     assert more.shards == 2
     assert more.new_bytes < more.bytes
     assert verify(root).problems == []
@@ -245,7 +245,7 @@ def test_a_version_that_grew_is_added_and_one_that_changed_is_refused(hub, tmp_p
     check_whole(tmp_path / "got", tmp_path / "v2")
     push(tmp_path / "v3", REPO, license="mit")
     before = tree(tmp_path / "got")
-    with pytest.raises(FolderInUseError, match=r"holds data/shard-00000.h5 of another version than user/crowd@"):
+    with pytest.raises(FolderInUseError, match=r"holds data/train-00000.h5 of another version than user/crowd@"):
         pull(REPO, tmp_path / "got")
     assert tree(tmp_path / "got") == before
     assert verify(tmp_path / "got").problems == []
@@ -254,9 +254,9 @@ def test_a_version_that_grew_is_added_and_one_that_changed_is_refused(hub, tmp_p
 @pytest.mark.slow
 def test_a_damaged_copy_is_mended(hub, pushed, template, tmp_path):
     root = pull(REPO, tmp_path / "got").root
-    path = root / "data" / "shard-00001.h5"
+    path = root / "data" / "val-00000.h5"
     path.write_bytes(path.read_bytes()[:-1])
-    (root / "worlds" / "shard-00002.npz").unlink()
+    (root / "worlds" / "test-00000.npz").unlink()
     hub.seen.clear()
     assert pull(REPO, root).complete
     check_whole(root, template)
@@ -284,14 +284,14 @@ def test_push_needs_a_licence(hub, template):
 
 def test_push_finds_damage_before_it_sends(hub, template, tmp_path):
     root = Path(shutil.copytree(template, tmp_path / "copy"))
-    path = root / "data" / "shard-00001.h5"
+    path = root / "data" / "val-00000.h5"
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
-    with pytest.raises(CorruptDataError, match=r"shard-00001.h5 differs from its SHA-256 .* Nothing was published"):
+    with pytest.raises(CorruptDataError, match=r"val-00000.h5 differs from its SHA-256 .* Nothing was published"):
         push(root, REPO, license="mit")
     path.unlink()
-    with pytest.raises((CorruptDataError, DatasetNotFoundError), match=r"shard-00001.h5 is missing"):
+    with pytest.raises((CorruptDataError, DatasetNotFoundError), match=r"val-00000.h5 is missing"):
         push(root, REPO, license="mit")
     assert hub.seen == []
 
@@ -349,13 +349,13 @@ def test_a_file_that_stays_wrong_never_counts(hub, pushed, template, tmp_path):
     root = tmp_path / "got"
     shard = Manifest.read(template).shards[1]
     hub.faults = [Fault("flip", shard.sha256, "GET", times=1000)]
-    with pytest.raises(CorruptDataError, match=r"data/shard-00001.h5 that does not have its SHA-256 .* was not kept"):
+    with pytest.raises(CorruptDataError, match=r"data/val-00000.h5 that does not have its SHA-256 .* was not kept"):
         pull(REPO, root)
-    assert not (root / "data" / "shard-00001.h5").exists()
+    assert not (root / "data" / "val-00000.h5").exists()
     with pytest.raises(DatasetNotFoundError):
         Manifest.read(root)
     kept = set(tree(root))
-    assert {"data/shard-00000.h5", "data/shard-00002.h5"} <= kept
+    assert {"data/train-00000.h5", "data/test-00000.h5"} <= kept
     hub.faults = []
     hub.seen.clear()
     assert pull(REPO, root).new_bytes == shard.bytes
@@ -450,10 +450,10 @@ def test_refusals_are_one_line(hub, pushed, tmp_path, status, words):
     ("path", "status", "code", "words"),
     few(
         [
-            (r"/resolve/.*/shard-00001.h5", 404, "EntryNotFound", "it lacks a file; check that navrep-data wrote it"),
+            (r"/resolve/.*/val-00000.h5", 404, "EntryNotFound", "it lacks a file; check that navrep-data wrote it"),
             (LARGE, 403, "", "the token may not do that"),  # as links that have expired do
-            (r"/resolve/.*/shard-00001.h5", 401, "", "it is private or not there, or the token is not accepted"),
-            (r"/resolve/.*/shard-00001.h5", 401, "GatedRepo", "it is gated: ask for access on its page"),
+            (r"/resolve/.*/val-00000.h5", 401, "", "it is private or not there, or the token is not accepted"),
+            (r"/resolve/.*/val-00000.h5", 401, "GatedRepo", "it is gated: ask for access on its page"),
             (LARGE, 404, "", "the Hub answers 404"),
             (r"/tree/", 404, "RevisionNotFound", "there is no such revision"),
         ],
@@ -496,14 +496,17 @@ def replace_manifest(hub, change):
             (lambda v: v["shards"][0].update(file="../../evil.h5"), "points outside the dataset"),
             (lambda v: v["shards"][0].update(file="/etc/evil.h5"), "points outside the dataset"),
             (lambda v: v["shards"][0].update(file="data/../x.h5"), "points outside the dataset"),
-            (lambda v: v["shards"][0].update(file=".navrep-data.lock"), "names a shard '.navrep-data.lock'"),
-            (lambda v: v["shards"][0].update(file="data/*.h5"), r"names a shard 'data/\*.h5', expected a plain name"),
-            (lambda v: v["shards"][0].update(file="data/sub/x.h5"), "names a shard 'data/sub/x.h5'"),
-            (lambda v: v["shards"][0]["worlds"].update(file="origin.json"), "names a worlds file 'origin.json'"),
-            (lambda v: v["extras"][0].update(file="media/x.html"), "names a extra 'media/x.html'"),
-            (lambda v: v["shards"][0].update(file="data/absent.h5"), "lacks data/absent.h5, which its manifest lists"),
-            (lambda v: v["shards"][0].update(bytes=1), "holds another data/shard-00000.h5"),
-            (lambda v: v["shards"][0].update(sha256="0" * 64), "holds another data/shard-00000.h5"),
+            (lambda v: v["shards"][0].update(file=".navrep-data.lock"), "'.navrep-data.lock', expected data/train-"),
+            (lambda v: v["shards"][0].update(file="data/*.h5"), r"'data/\*.h5', expected data/train-, a number"),
+            (lambda v: v["shards"][0].update(file="data/sub/x.h5"), "'data/sub/x.h5', expected data/train-"),
+            (lambda v: v["shards"][0]["worlds"].update(file="origin.json"), "'origin.json', expected worlds/train-000"),
+            (lambda v: v["extras"][0].update(file="media/x.html"), "'media/x.html', expected index.json, or a .png"),
+            (
+                lambda v: v["shards"][0].update(file="data/train-00009.h5", worlds=None),
+                "lacks data/train-00009.h5, which",
+            ),
+            (lambda v: v["shards"][0].update(bytes=1), "holds another data/train-00000.h5"),
+            (lambda v: v["shards"][0].update(sha256="0" * 64), "holds another data/train-00000.h5"),
             (lambda v: v.update(complete=False), "holds an unfinished dataset"),
         ],
         4,
@@ -534,7 +537,7 @@ def test_a_repository_without_a_dataset(hub, pushed, tmp_path):
 @pytest.mark.slow
 def test_a_server_that_sends_without_end(hub, pushed, tmp_path, monkeypatch):
     """It announces the right size and sends more, without a length; what it sends is bounded."""
-    shard = hub.repo(REPO).files()["data/shard-00000.h5"]
+    shard = hub.repo(REPO).files()["data/train-00000.h5"]
     monkeypatch.setattr(_hub_client, "_SLACK", 1000)
     import hashlib
 
@@ -722,7 +725,7 @@ def test_cli(command, hub, template, tmp_path):
     assert json.loads(out)["shards"] == 2
     code, out, err = command("info", "data/crowd")
     assert f"from: {REPO} at commit {commit}" in out
-    assert "(partial: 2 of 3 shards, 4 of 6 sequences)" in out
+    assert "(partial: 2 of 3 shards, 3 of 4 sequences)" in out
     code, out, err = command("verify", "data/crowd")
     assert code == 0, out
     code, out, err = command("pull", "user/none")

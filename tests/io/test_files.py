@@ -48,7 +48,7 @@ def test_names_from_outside_stay_inside(tmp_path, name):
 
 
 def test_ordinary_names_are_joined(tmp_path):
-    assert io.safe_join(tmp_path, "data/shard-00000.h5") == tmp_path / "data" / "shard-00000.h5"
+    assert io.safe_join(tmp_path, "data/train-00000.h5") == tmp_path / "data" / "train-00000.h5"
 
 
 def test_json_is_bounded_and_checked(tmp_path):

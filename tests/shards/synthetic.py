@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from navrep_data.observations import scan_to_rings
-from navrep_data.schema import COLUMNS, Event, SensorContract
-from navrep_data.shards import Manifest, ShardWriter, dataset_card, publish
+from navrep_data.schema import COLUMNS, LABEL_HUMAN, Event, SensorContract
+from navrep_data.shards import SPLIT_RULE, DatasetWriter, Manifest, ShardWriter, split_of
 
 SENSOR = SensorContract()
 MAX_HUMANS = 6
@@ -48,6 +48,7 @@ def make_sequence(
     table = {
         "scan": scan,
         "rings": scan_to_rings(scan),
+        "scan_label": np.repeat(rng.integers(0, LABEL_HUMAN + MAX_HUMANS, (rows, 27)), 40, axis=1).astype(np.uint8),
         "robot_state": rng.normal(size=(rows, 5)).astype(np.float32),
         "action": np.where(last[:, None], 0, rng.uniform(-1, 1, (rows, 3))).astype(np.float32),
         "reward": np.where(last, 0, rng.normal(size=rows)).astype(np.float32),
@@ -55,6 +56,7 @@ def make_sequence(
         "is_last": last,
         "is_terminal": (event >= 1) & (event <= 3),
         "event": event,
+        "contact": np.where(last, 0, rng.integers(0, 4, rows)).astype(np.uint8),
         "sequence": np.full(rows, sequence, np.int32),
         "episode": episode.astype(np.int32),
         "step": (np.arange(rows) - starts[episode]).astype(np.int32),
@@ -88,7 +90,7 @@ def make_sequence(
     return {name: table[name] for name in columns}, worlds
 
 
-def make_writer(first: int = 0, length: int = 100, **changes: Any) -> ShardWriter:
+def make_writer(split: str = "train", length: int = 100, **changes: Any) -> ShardWriter:
     """Return a writer with the defaults of these tests."""
     settings = {
         "env": "soadrl",
@@ -99,7 +101,7 @@ def make_writer(first: int = 0, length: int = 100, **changes: Any) -> ShardWrite
         "columns": ALL_COLUMNS,
         "max_humans": MAX_HUMANS,
     }
-    return ShardWriter(**{**settings, **changes}, length=length, first_sequence=first)
+    return ShardWriter(**{**settings, **changes}, length=length, split=split)
 
 
 def make_dataset(
@@ -109,19 +111,13 @@ def make_dataset(
     length: int = 100,
     *,
     worlds: bool = True,
+    by_rule: bool = False,
     **changes: Any,
 ) -> Manifest:
-    """Write a whole dataset and return its manifest."""
+    """Write a whole dataset and return its manifest; all of it is for training, unless splits are `by_rule`."""
     root.mkdir(parents=True, exist_ok=True)
     scan_dtype = changes.get("scan_dtype", "uint16")
     columns = changes.get("columns", ALL_COLUMNS)
-    entries = []
-    for index, first in enumerate(range(0, sequences, shard_size)):
-        writer = make_writer(first, length, **changes)
-        for k in range(first, min(first + shard_size, sequences)):
-            table, world = make_sequence(k, length, scan_dtype=scan_dtype, columns=columns)
-            writer.append(table, world if worlds else None)
-        entries.append(publish(root, index, writer.finish()))
     manifest = Manifest(
         env="soadrl",
         physics="consistent",
@@ -137,5 +133,10 @@ def make_dataset(
         policy={"name": "orca"},
         versions={"navrep-data": "0"},
         command=f"navrep-data generate --env soadrl --n {sequences}",
-    ).with_shards(entries, complete=True)
-    return manifest.save(root, card=dataset_card(manifest))
+        split_rule=SPLIT_RULE if by_rule else "all are train",
+    )
+    writer = DatasetWriter(root, manifest)
+    for k in range(sequences):
+        table, world = make_sequence(k, length, scan_dtype=scan_dtype, columns=columns)
+        writer.append(k, split_of(k) if by_rule else "train", table, world if worlds else None)
+    return writer.finish()

@@ -23,6 +23,7 @@ from navrep_data.errors import (
 from navrep_data.io import json_bytes
 from navrep_data.schema import Event
 from navrep_data.shards import (
+    SPLIT_RULE,
     SPLITS,
     DatasetFolder,
     Manifest,
@@ -30,11 +31,12 @@ from navrep_data.shards import (
     choose_shards,
     chunk_rows,
     content_hash,
+    count_in_split,
     dataset_card,
     dataset_record,
-    default_splits,
     estimate_bytes,
     info,
+    nth_of_split,
     read_origin,
     select_shards,
     split_of,
@@ -62,14 +64,15 @@ def test_a_dataset_is_a_function_of_its_input(dataset, tmp_path):
             assert (tmp_path / "again" / path.relative_to(dataset)).read_bytes() == path.read_bytes()
 
 
-def test_default_splits_are_stable_and_cover_everything():
-    for n in (0, 1, 3, 10, 57):
-        splits = default_splits(n)
-        where = {k: name for name, ranges in splits.items() for a, b in ranges for k in range(a, b)}
-        assert sorted(where) == list(range(n))
-        later = default_splits(n + 13)
-        assert all(any(a <= k < b for a, b in later[name]) and name == split_of(k) for k, name in where.items())
-    assert all(default_splits(3)[name] for name in SPLITS)
+def test_the_rule_of_splits_is_stable_and_covers_everything():
+    for n in (0, 1, 2, 3, 10, 57):
+        members = {name: [nth_of_split(name, k) for k in range(count_in_split(name, n))] for name in SPLITS}
+        assert sorted(k for numbers in members.values() for k in numbers) == list(range(n))
+        assert all(split_of(k) == name for name, numbers in members.items() for k in numbers)
+        assert all(numbers == sorted(numbers) for numbers in members.values())
+        assert all(nth_of_split(name, len(numbers)) >= n for name, numbers in members.items())
+    assert all(count_in_split(name, 3) for name in SPLITS)
+    assert [split_of(k) for k in (1, 2, 11, 12)] == ["val", "test"] * 2
 
 
 def change(root, edit, sign=True):
@@ -94,27 +97,36 @@ def change(root, edit, sign=True):
         (lambda v: v.update(columns=v["columns"][::-1]), "'columns'"),
         (lambda v: v.update(columns=[[]]), "'columns'"),
         (lambda v: v.update(scan_dtype="int8"), "'scan_dtype'"),
+        (lambda v: v.update(inputs={"policy": "no hash"}), "'inputs'"),
+        (lambda v: v.update(origins={"map:m": [1.0]}), "'origins'"),
+        (lambda v: v.update(origins={"map:m": [True, 0.0]}), "'origins'"),
         (lambda v: v.update(max_humans=10**9), "'max_humans'"),
         (lambda v: v["sensor"].update(n_rays=10**9), "'sensor'"),
         (lambda v: v["sensor"].pop("dt"), "'sensor'"),
         (lambda v: v.update(statistics={"columns": {}}), "'statistics'"),
-        (lambda v: v.update(splits={"train": [[3, 1]]}), "'splits'"),
-        (lambda v: v.update(splits={"train": [[0, 2]], "val": [[1, 2]]}), "two splits"),
-        (lambda v: v.update(splits={"all": [[0, 6]]}), "named"),
-        (lambda v: v.update(splits={"train": [[0, 7]]}), "holds sequence 6"),
+        (lambda v: v["shards"][0].update(split="all"), r"'shards\[0\].split'"),
+        (lambda v: v["shards"][0].pop("split"), r"'shards\[0\].split'"),
+        (lambda v: v["shards"][0].update(split="val"), "as files of split val are called"),
+        (lambda v: v["shards"][0].update(file="data/val-00000.h5"), "as files of split train are called"),
+        (lambda v: v.update(split_rule=SPLIT_RULE), "of split train holds sequence 1, which is of split val"),
+        (lambda v: v["shards"][1].update(sequences=[[3, 4], [4, 6]]), r"'shards\[1\].sequences'"),
+        (lambda v: v["shards"][1].update(sequences=[[5, 6], [3, 5]]), r"'shards\[1\].sequences'"),
+        (lambda v: v["shards"][1].update(sequences=[]), r"'shards\[1\].sequences'"),
+        (lambda v: v["shards"][1].update(sequences=[[2, 5]]), "holds sequence 2, which data/train-00000.h5 holds too"),
+        (lambda v: v["shards"][1].update(sequences=[[4, 7]]), "does not hold the sequences 3 to 3"),
         (lambda v: v["shards"][0].update(file="../../etc/passwd"), "outside the dataset"),
         (lambda v: v["shards"][0].update(file="/etc/passwd"), "outside the dataset"),
         (lambda v: v["shards"][0]["worlds"].update(file="worlds/../../x"), "outside the dataset"),
         (lambda v: v["shards"][0].update(sha256="0" * 63), r"'shards\[0\].sha256'"),
         (lambda v: v["shards"][1].update(bytes=-4), r"'shards\[1\].bytes'"),
-        (lambda v: v["shards"][1].update(sequences=[3, 3]), r"'shards\[1\].sequences'"),
+        (lambda v: v["shards"][1].update(sequences=[[3, 3]]), r"'shards\[1\].sequences'"),
         (lambda v: v["shards"][1].update(sequence_hashes=[]), "sequence_hashes"),
         (lambda v: v["shards"][1].update(statistics=None), "statistics"),
         (lambda v: v["shards"][0].update(rows=10**9), "rows for 3 sequences"),
-        (lambda v: v["shards"].reverse(), "another shard|missing"),
-        (lambda v: v["shards"].pop(0), "missing in a complete"),
-        (lambda v: v["shards"].pop(), "complete with 3 of 6|holds sequence"),
-        (lambda v: v["shards"][1].update(file=v["shards"][0]["file"]), "twice"),
+        (lambda v: v["shards"].reverse(), "not in the order"),
+        (lambda v: v["shards"].pop(0), "complete, but does not hold the sequences 0 to 2"),
+        (lambda v: v["shards"].pop(), "complete, but does not hold the sequences 3 to 5"),
+        (lambda v: v["shards"][1].update({k: v["shards"][0][k] for k in ("file", "worlds")}), "twice"),
         (lambda v: v.update(shards=[3]), "not a JSON object"),
         (lambda v: v.update(rows=1), "not the sums"),
         (lambda v: v.update(card_sha256=3), "'card_sha256'"),
@@ -139,7 +151,10 @@ def test_missing_broken_and_newer(dataset, tmp_path, monkeypatch):
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetNotFoundError, match=r"no manifest\.json"):
         Manifest.read(tmp_path / "empty")
-    change(dataset, lambda v: v.update(format_version=2))
+    change(dataset, lambda v: v.update(format_version=1))
+    with pytest.raises(SchemaVersionError, match="never released; expected 2 or newer: generate or import it again"):
+        Manifest.read(dataset)
+    change(dataset, lambda v: v.update(format_version=3))
     with pytest.raises(SchemaVersionError, match="pip install -U navrep-data"):
         Manifest.read(dataset)
     for text in (b"{", b"[]", b"null", b"\xff\xfe", b"[" * 100_000, b'{"a": NaN}'):
@@ -159,9 +174,9 @@ def test_shards_may_come_in_any_order_with_gaps_until_complete(dataset):
     part = manifest.with_shards(manifest.shards[1:], complete=False).save(dataset)
     assert Manifest.read(dataset) == part
     assert part.sequences == 3
-    with pytest.raises(ConfigError, match="missing"):
+    with pytest.raises(ConfigError, match="does not hold"):
         manifest.with_shards(manifest.shards[1:], complete=True)
-    with pytest.raises(ConfigError, match="another shard"):
+    with pytest.raises(ConfigError, match="holds too"):
         manifest.with_shards([*manifest.shards, manifest.shards[0]], complete=True)
 
 
@@ -196,9 +211,8 @@ def test_folder_reads_and_indexes(dataset):
         columns, _ = make_sequence(k)
         starts = np.flatnonzero(columns["is_first"])
         for start, stop in zip(starts, [*starts[1:], 100], strict=True):
-            split = SPLITS.index(split_of(k))
             where = (k, columns["episode"][start], k // 3, start + 100 * (k % 3))
-            expected.append((*where, stop - start, columns["event"][stop - 1], split))
+            expected.append((*where, stop - start, columns["event"][stop - 1], 0))
             got = folder.read("robot_state", k // 3, start + 100 * (k % 3), stop + 100 * (k % 3))
             assert np.array_equal(got, columns["robot_state"][start:stop])
     names = ("sequence", "episode", "shard", "start", "length", "event", "split")
@@ -231,7 +245,7 @@ def test_info_and_card(dataset):
     values = info(dataset)
     assert json.loads(json.dumps(values)) == values
     assert values["rows"] == 600
-    assert values["splits"] == {"train": 4, "val": 1, "test": 1}
+    assert values["splits"] == {"train": 6, "val": 0, "test": 0}
     files = [p for folder in ("data", "worlds") for p in (dataset / folder).iterdir()]
     assert values["bytes"] == sum(p.stat().st_size for p in files)
     card = (dataset / "README.md").read_text()
@@ -301,8 +315,8 @@ def test_estimate_is_near_for_full_size_columns():
 
 @pytest.fixture
 def six(tmp_path):
-    """Six sequences in three shards."""
-    make_dataset(tmp_path / "six", 6, 2, 50)
+    """Six sequences in four shards: two for training, with 0, 3 and 4, 5, one each for val, 1, and test, 2."""
+    make_dataset(tmp_path / "six", 6, 2, 50, by_rule=True)
     return tmp_path / "six"
 
 
@@ -310,21 +324,22 @@ def six(tmp_path):
 def test_a_part_of_a_dataset_is_a_dataset_that_says_so(six):
     whole = Manifest.read(six)
     assert select_shards(whole, range(len(whole.shards))) is whole
-    part = select_shards(whole, [0, 2])
+    part = select_shards(whole, [0, 3])
     assert Manifest.from_dict(json.loads(json.dumps(part.to_dict())), six) == part
-    assert (part.complete, part.planned, part.sequences) == (False, whole.planned, 4)
+    assert (part.complete, part.planned, part.sequences) == (False, whole.planned, 3)
     assert part.partial["manifest_sha256"] == whole.to_dict()["manifest_sha256"]
-    assert {k: whole.split_of(k) for k in (0, 1, 4, 5)} == {k: part.split_of(k) for k in (0, 1, 4, 5)}
-    assert part.split_of(2) is None
-    assert part.rows == sum(whole.shards[k].rows for k in (0, 2))
+    assert {k: part.split_of(k) for k in (0, 3, 2)} == {0: "train", 3: "train", 2: "test"}
+    assert part.split_of(1) is None
+    assert part.rows == sum(whole.shards[k].rows for k in (0, 3))
     part.save(six, dataset_card(part))
-    for name in (whole.shards[1].file, whole.shards[1].worlds.file):
-        (six / name).unlink()
+    for gone in whole.shards[1:3]:
+        (six / gone.file).unlink()
+        (six / gone.worlds.file).unlink()
     assert verify(six).problems == []
-    assert info(six)["splits"] == {"train": 3, "val": 1, "test": 0}
-    assert "a part**: 2 of 3 shards, 4 of 6 sequences" in (six / "README.md").read_text()
+    assert info(six)["splits"] == {"train": 2, "val": 0, "test": 1}
+    assert "a part**: 2 of 4 shards, 3 of 6 sequences" in (six / "README.md").read_text()
     with DatasetFolder(six) as folder:
-        assert set(folder.episodes.sequence.tolist()) == {0, 1, 4, 5}
+        assert set(folder.episodes.sequence.tolist()) == {0, 2, 3}
         assert folder.provenance["partial"] is True
 
 
@@ -332,10 +347,10 @@ def test_a_part_of_a_dataset_is_a_dataset_that_says_so(six):
 @pytest.mark.parametrize(
     ("asked", "chosen"),
     [
-        ({}, [0, 1, 2]),
-        ({"split": "val"}, [0]),
-        ({"split": "test"}, [1]),
-        ({"split": "train", "shards": [1, 2]}, [1, 2]),
+        ({}, [0, 1, 2, 3]),
+        ({"split": "val"}, [2]),
+        ({"split": "test"}, [3]),
+        ({"split": "train", "shards": [1, 2]}, [1]),
     ],
 )
 def test_choose_shards(six, asked, chosen):
@@ -347,7 +362,7 @@ def test_choose_shards(six, asked, chosen):
     ("asked", "words"),
     [
         ({"split": "vall"}, "Unknown split 'vall'; expected train, val, test. Did you mean 'val'?"),
-        ({"shards": [0, 3]}, "There is no shard 3, expected numbers from 0 to 2."),
+        ({"shards": [0, 4]}, "There is no shard 4, expected numbers from 0 to 3."),
         ({"split": "val", "shards": [1]}, "No shard is left"),
     ],
 )
@@ -367,17 +382,16 @@ def test_content_hash_is_of_the_rows_alone(dataset, tmp_path):
     assert len({*seen, content_hash(swapped)}) == 4
 
 
-def test_card_lists_shards_by_split_where_each_belongs_to_one(tmp_path):
+def test_card_tells_the_hub_which_files_are_of_which_split(tmp_path):
     yaml = pytest.importorskip("yaml")
-    manifest = make_dataset(tmp_path, 4, 1, 20)
+    manifest = make_dataset(tmp_path, 2, 1, 20, by_rule=True)
     head = yaml.safe_load(dataset_card(manifest).split("---\n")[1])
     files = {d["split"]: d["path"] for d in head["configs"][0]["data_files"]}
     assert files == {
-        "train": ["data/shard-00000.h5", "data/shard-00003.h5"],
-        "val": ["data/shard-00001.h5"],
-        "test": ["data/shard-00002.h5"],
+        "train": "data/train-*.h5",
+        "val": "data/val-*.h5",
     }
-    assert "Each shard belongs to one split" in dataset_card(manifest)
+    assert "each file belongs to one split" in dataset_card(manifest)
 
 
 @pytest.mark.parametrize(
@@ -385,7 +399,8 @@ def test_card_lists_shards_by_split_where_each_belongs_to_one(tmp_path):
     [
         ({"license": "my licence"}, "field 'license' is 'my licence', expected a licence identifier"),
         ({"extras": [{"file": "../x.png", "sha256": "0" * 64, "bytes": 1}]}, "points outside the dataset"),
-        ({"extras": [{"file": "README.md", "sha256": "0" * 64, "bytes": 1}]}, "a file is listed twice"),
+        ({"extras": [{"file": "README.md", "sha256": "0" * 64, "bytes": 1}]}, "expected index.json, or a .png or .gif"),
+        ({"extras": 2 * [{"file": "media/x.png", "sha256": "0" * 64, "bytes": 1}]}, "a file is listed twice"),
         ({"partial": {"manifest_sha256": "0" * 64, "shards": 1, "sequences": 1, "rows": 1}}, "both complete and part"),
         ({"partial": {"manifest_sha256": "0" * 64, "shards": -1}}, "field 'partial.shards' is -1"),
     ],

@@ -14,9 +14,9 @@ from .synthetic import ALL_COLUMNS, make_sequence, make_writer
 
 
 def image_of(sequences, first=0, **changes):
-    writer = make_writer(first, 200, **changes)
-    for columns, worlds in sequences:
-        writer.append(columns, worlds)
+    writer = make_writer(length=200, **changes)
+    for k, (columns, worlds) in enumerate(sequences, first):
+        writer.append(k, columns, worlds)
     return writer.finish().statistics
 
 

@@ -67,15 +67,15 @@ def test_hundreds_of_flipped_bytes_are_found(tmp_path):
 
 
 def test_missing_unlisted_truncated(dataset):
-    shard, worlds = dataset / "data/shard-00001.h5", dataset / "worlds/shard-00000.npz"
-    (dataset / "data/shard-00007.h5").write_bytes(b"x")
+    shard, worlds = dataset / "data/train-00001.h5", dataset / "worlds/train-00000.npz"
+    (dataset / "data/train-00007.h5").write_bytes(b"x")
     shard.write_bytes(shard.read_bytes()[:-100])
     worlds.unlink()
     (dataset / "README.md").unlink()
     problems = {p.file: p.what for p in verify(dataset).problems}
-    assert "not in the manifest" in problems["data/shard-00007.h5"]
-    assert "bytes, expected" in problems["data/shard-00001.h5"]
-    assert "missing" in problems["worlds/shard-00000.npz"]
+    assert "not in the manifest" in problems["data/train-00007.h5"]
+    assert "bytes, expected" in problems["data/train-00001.h5"]
+    assert "missing" in problems["worlds/train-00000.npz"]
     assert "missing" in problems["README.md"]
     assert all("\n" not in what for what in problems.values())
     with pytest.raises(DatasetNotFoundError):
@@ -92,7 +92,7 @@ def spoil(root, monkeypatch, change):
         columns, worlds = make_sequence(k)
         if k == 0:
             change(columns)
-        writer.append(columns, worlds)
+        writer.append(k, columns, worlds)
     # The old statistics: those of infinity are no JSON.
     entry = replace(publish(root, 0, writer.finish()), statistics=manifest.shards[0].statistics)
     manifest = manifest.with_shards([entry, *manifest.shards[1:]], complete=True)
@@ -131,7 +131,7 @@ def test_wrong_content_behind_right_hashes(dataset, monkeypatch, change, match):
     assert np.isfinite(columns["humans"][:2, 0]).all(), "these cases need a human in the first slot"
     monkeypatch.setattr(writer_module.ShardWriter, "_check_worlds", staticmethod(lambda *_: None))
     spoil(dataset, monkeypatch, change)
-    problems = [p for p in verify(dataset).problems if p.file == "data/shard-00000.h5"]
+    problems = [p for p in verify(dataset).problems if p.file == "data/train-00000.h5"]
     assert any(re.search(match, p.what) for p in problems), problems
 
 
@@ -155,7 +155,10 @@ def test_wrong_sequence_hash_and_statistics(dataset):
 def test_swapped_worlds_and_a_hostile_shard(dataset):
     manifest = Manifest.read(dataset)
     a, b = manifest.shards
-    swapped = [replace(a, worlds=b.worlds), replace(b, worlds=a.worlds)]
+    paths = [dataset / shard.worlds.file for shard in (a, b)]
+    for path, data in zip(paths, [path.read_bytes() for path in reversed(paths)], strict=True):
+        path.write_bytes(data)
+    swapped = [replace(one, worlds=replace(other.worlds, file=one.worlds.file)) for one, other in ((a, b), (b, a))]
     manifest.with_shards(swapped, complete=False).save(dataset)
     assert {p.what for p in verify(dataset).problems} == {"its episodes are not those of the shard"}
     data = b"\x89HDF\r\n\x1a\n" + b"\0" * 500

@@ -23,8 +23,8 @@ def arrays():
 def test_round_trip_over_sequences(tmp_path):
     writer = make_writer()
     given = [make_sequence(k) for k in range(3)]
-    for columns, worlds in given:
-        writer.append(columns, worlds)
+    for k, (columns, worlds) in enumerate(given):
+        writer.append(k, columns, worlds)
     path = tmp_path / "w.npz"
     path.write_bytes(writer.finish().worlds)
     worlds = read_worlds(path)
@@ -58,6 +58,57 @@ def test_plain_numpy_reads_it_and_bytes_repeat(arrays, tmp_path):
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         assert archive.testzip() is None
         assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+
+
+def with_drawn(arrays, scale=1):
+    """Return the arrays with a robot of its own, two lidars and people of their own in each episode."""
+    n, h = len(arrays["episode"]), len(arrays["human_start"])
+    corners, lidars = np.arange(n + 1) * 4, np.arange(n + 1) * 2
+    drawn = {
+        "robot_max_velocity": np.full((n, 3), 0.5 * scale), "robot_acceleration": np.full((n, 3), 1.0),
+        "robot_drive": np.full(n, b"differential"), "footprint_offset": corners,
+        "footprint": np.arange(8.0 * n).reshape(-1, 2) * scale, "lidar_offset": lidars,
+        "lidar_pose": np.arange(6.0 * n).reshape(-1, 3), "lidar_rays": np.full(2 * n, 540),
+        "lidar_angles": np.full((2 * n, 2), (-2.3, 0.01)), "lidar_ranges": np.full((2 * n, 2), (0.1, 25.0)),
+        "human_model": np.full(h, b"orca"), "human_radius": np.linspace(0.2, 0.4, h),
+    }  # fmt: skip
+    return module.as_worlds({**arrays, **drawn})
+
+
+def test_what_is_drawn_per_episode_has_its_place(arrays):
+    given = [with_drawn(arrays, scale) for scale in (1, 2)]
+    joined = module.concatenate_worlds(given)
+    worlds = module.parse_worlds(module.worlds_bytes(joined), "w.npz")
+    n = len(arrays["episode"])
+    assert set(worlds.arrays) == {*WORLD_FIELDS, *module.DRAWN_WORLD_FIELDS}
+    for e in range(2 * n):
+        found = worlds.episode(e).drawn
+        assert set(found) == set(module.DRAWN_WORLD_FIELDS) - {"footprint_offset", "lidar_offset"}
+        scale, k = 1 + e // n, e % n
+        np.testing.assert_array_equal(found["footprint"], (8 * k + np.arange(8.0).reshape(4, 2)) * scale)
+        np.testing.assert_array_equal(found["lidar_pose"], 6 * k + np.arange(6.0).reshape(2, 3))
+        assert found["robot_max_velocity"].tolist() == [0.5 * scale] * 3
+        assert found["robot_drive"] == b"differential"
+        assert len(found["human_radius"]) == len(worlds.episode(e).human_start)
+    again = module.take_episodes(joined, n, 2 * n)
+    assert all(np.array_equal(again[name], values) for name, values in given[1].items())
+    assert set(module.concatenate_worlds([arrays, given[0]])) == set(WORLD_FIELDS)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda a: a.pop("human_model"), "'human_model' is missing"),
+        (lambda a: a["lidar_offset"].__setitem__(-1, 99), "'lidar_offset'"),
+        (lambda a: a.update(footprint=a["footprint"][:-1]), "'footprint_offset'"),
+        (lambda a: a.update(lidar_rays=a["lidar_rays"][:-1]), "'lidar_rays' has"),
+    ],
+)
+def test_inconsistent_drawn_arrays_are_refused(arrays, change, match):
+    drawn = with_drawn(arrays)
+    change(drawn)
+    with pytest.raises(CorruptDataError, match=match):
+        module.as_worlds(drawn)
 
 
 @pytest.mark.parametrize(

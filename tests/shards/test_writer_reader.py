@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import multiprocessing
 import os
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -14,11 +16,11 @@ import numpy as np
 import pytest
 
 from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError, SchemaVersionError
-from navrep_data.schema import COLUMNS
-from navrep_data.shards import Shard, chunk_rows, publish
+from navrep_data.schema import COLUMNS, LABEL_HUMAN
+from navrep_data.shards import DatasetFolder, Shard, chunk_rows, dataset_card, publish, verify
 from navrep_data.shards._codec import encode, inflate, unshuffle
 
-from .synthetic import ALL_COLUMNS, make_sequence, make_writer
+from .synthetic import ALL_COLUMNS, MAX_HUMANS, make_dataset, make_sequence, make_writer
 
 VARIANTS = {
     "all": {},
@@ -30,12 +32,12 @@ VARIANTS = {
 
 
 def write(path: Path, rows: list[int], length: int, first: int = 0, **changes):
-    writer = make_writer(first, length, **changes)
+    writer = make_writer(length=length, **changes)
     parts = []
     for k, n in enumerate(rows):
         given = {key: changes[key] for key in ("scan_dtype", "columns") if key in changes}
         columns, worlds = make_sequence(first + k, n, **given)
-        writer.append(columns, worlds)
+        writer.append(first + k, columns, worlds)
         parts.append(columns)
     image = writer.finish()
     path.write_bytes(image.data)
@@ -95,15 +97,15 @@ def test_bytes_are_a_function_of_the_input(tmp_path):
 def test_sequence_hash_ignores_rings_chunks_and_nan_payloads():
     columns, worlds = make_sequence(0)
     plain = make_writer()
-    plain.append(columns, worlds)
+    plain.append(0, columns, worlds)
     odd = dict(columns)
     bits = columns["humans"].copy().view(np.uint32)
     bits[np.isnan(columns["humans"])] = 0x7FC12345
     odd["humans"] = bits.view(np.float32)
     other = make_writer()
-    other.append(odd, worlds)
+    other.append(0, odd, worlds)
     bare = make_writer(columns=VARIANTS["no_rings"]["columns"])
-    bare.append({k: v for k, v in columns.items() if k != "rings"}, worlds)
+    bare.append(0, {k: v for k, v in columns.items() if k != "rings"}, worlds)
     a, b, c = plain.finish(), other.finish(), bare.finish()
     assert a.data == b.data
     assert a.sequence_hashes == b.sequence_hashes == c.sequence_hashes
@@ -111,9 +113,10 @@ def test_sequence_hash_ignores_rings_chunks_and_nan_payloads():
         if name in ("rings", "sequence", "episode", "step", "is_first", "is_last", "is_terminal", "event"):
             continue
         changed = {k: v.copy() for k, v in columns.items()}
-        changed[name].reshape(-1)[0] += 1
+        first = changed[name].reshape(-1)
+        first[0] = first[0] == 0 if name in ("scan_label", "contact") else first[0] + 1
         third = make_writer()
-        third.append(changed, worlds)
+        third.append(0, changed, worlds)
         assert (third.finish().sequence_hashes == a.sequence_hashes) == np.isnan(changed[name].reshape(-1)[0]), name
 
 
@@ -198,11 +201,11 @@ def test_append_refuses_and_stays_usable(change, match):
     change(bad)
     writer = make_writer()
     with pytest.raises(CorruptDataError, match=match) as error:
-        writer.append(bad, worlds)
+        writer.append(0, bad, worlds)
     assert "\n" not in str(error.value)
-    writer.append(good, worlds)
+    writer.append(0, good, worlds)
     fresh = make_writer()
-    fresh.append(good, worlds)
+    fresh.append(0, good, worlds)
     assert writer.finish().data == fresh.finish().data
 
 
@@ -213,15 +216,16 @@ def test_writer_refuses_bad_settings():
         ({"columns": (*ALL_COLUMNS, "ring")}, "Did you mean 'rings'"),
         ({"max_humans": 0}, "max_humans"),
         ({"seed": -1}, "seed"),
+        ({"split": "all"}, "split is 'all'; expected one of: train, val, test"),
     ):
         with pytest.raises(ConfigError, match=match):
             make_writer(**changes)
     with pytest.raises(CorruptDataError, match="without sequences"):
         make_writer().finish()
     mixed = make_writer()
-    mixed.append(*make_sequence(0))
+    mixed.append(0, *make_sequence(0))
     with pytest.raises(CorruptDataError, match="no worlds"):
-        mixed.append(make_sequence(1)[0])
+        mixed.append(1, make_sequence(1)[0])
 
 
 def test_publish_leaves_the_old_state_when_interrupted(tmp_path, monkeypatch):
@@ -310,8 +314,43 @@ def test_hostile_files_are_refused(shard_file, change, match):
     assert "navrep-data verify" in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("scan_label", LABEL_HUMAN + MAX_HUMANS, f"'scan_label' holds {LABEL_HUMAN + MAX_HUMANS}, expected at most"),
+        ("contact", 4, "'contact' holds 4, expected 0 to 3"),
+    ],
+)
+def test_labels_and_contacts_that_mean_nothing_are_refused_and_found(name, value, words, tmp_path):
+    columns, worlds = make_sequence(0)
+    columns[name].reshape(-1)[7] = value
+    with pytest.raises(CorruptDataError, match=rf"^Sequence 0: column {words}") as caught:
+        make_writer().append(0, columns, worlds)
+    assert "\n" not in str(caught.value)
+    manifest = make_dataset(tmp_path / "d", 2, 2, 50)
+    file = tmp_path / "d" / manifest.shards[0].file
+
+    def change(f):
+        stored = f[name][...]
+        stored.reshape(-1)[7] = value
+        f[name][...] = stored
+
+    rewrite(file, change)
+    data = file.read_bytes()
+    entry = replace(manifest.shards[0], sha256=hashlib.sha256(data).hexdigest(), bytes=len(data))
+    replace(manifest, shards=(entry,)).save(tmp_path / "d", dataset_card(manifest))
+    assert any(words in problem.what for problem in verify(tmp_path / "d").problems)
+
+
+def test_a_file_that_lies_about_its_split_is_refused(tmp_path):
+    manifest = make_dataset(tmp_path / "d", 4, 2, 50)
+    rewrite(tmp_path / "d" / manifest.shards[1].file, lambda f: f.attrs.__setitem__("split", np.bytes_("val")))
+    with DatasetFolder(tmp_path / "d") as folder, pytest.raises(CorruptDataError, match="belongs to split 'val', the"):
+        folder.read("step", 1, 0, 1)
+
+
 def test_newer_version_names_the_command(shard_file):
-    rewrite(shard_file, lambda f: f.attrs.__setitem__("format_version", 2))
+    rewrite(shard_file, lambda f: f.attrs.__setitem__("format_version", 3))
     with pytest.raises(SchemaVersionError, match="pip install -U navrep-data"):
         Shard(shard_file)
 

@@ -427,10 +427,10 @@ def test_encoding_goes_on_after_an_interruption_and_refuses_other_codes(dataset,
     vae, codes = latents
     copy = tmp_path / "copy"
     shutil.copytree(codes, copy)
-    (copy / "data" / "shard-00001.h5").write_bytes(b"cut")
+    (copy / "data" / "val-00000.h5").write_bytes(b"cut")
     again = encode_dataset(dataset, vae, copy, name="V")
     assert again.complete
-    for name in ("manifest.json", "data/shard-00000.h5", "data/shard-00001.h5"):
+    for name in ("manifest.json", "data/train-00000.h5", "data/val-00000.h5"):
         assert (copy / name).read_bytes() == (codes / name).read_bytes()
     with pytest.raises(DatasetMismatchError, match="codes of another model"):
         encode_dataset(dataset, VAE(VAEConfig("1d", 8)), copy)
@@ -438,7 +438,7 @@ def test_encoding_goes_on_after_an_interruption_and_refuses_other_codes(dataset,
         encode_dataset(dataset, vae, dataset / "data")
 
 
-@pytest.mark.parametrize("where", ["manifest.json", "data/shard-00000.h5"])
+@pytest.mark.parametrize("where", ["manifest.json", "data/train-00000.h5"])
 def test_damaged_codes_are_refused(where, latents, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(latents[1], copy)

@@ -21,7 +21,7 @@ from navrep_data.view import dataset_page
 
 
 def rows_of(folder, sequence):
-    index = next(k for k, s in enumerate(folder.manifest.shards) if s.sequences[0] <= sequence < s.sequences[1])
+    index, _ = folder.manifest.place_of(sequence)
     rows = np.flatnonzero(folder.read("sequence", index, 0, folder.shard(index).rows) == sequence)
     return index, int(rows[0]), int(rows[-1]) + 1
 
@@ -126,12 +126,24 @@ def test_equal_data_give_equal_pages(dataset):
 
 @pytest.mark.parametrize(
     ("sequences", "max_bytes", "words"),
-    [([4], 6_000_000, "Sequence 4 is not in .*it has 0 to 3"), ([-1], 6_000_000, "Sequence -1"),
+    [([4], 6_000_000, "Sequence 4 is not in .*it has 4 from 0 to 3"), ([-1], 6_000_000, "Sequence -1"),
      (range(60), 6_000_000, "60 sequences were asked for"), (None, 1000, "expected at least 100,000")],
 )  # fmt: skip
 def test_what_cannot_be_shown_is_an_error(dataset, sequences, max_bytes, words):
     with pytest.raises(ConfigError, match=words):
         dataset_page(dataset, sequences, max_bytes=max_bytes)
+
+
+def test_labels_are_on_the_page_where_the_dataset_has_them(dataset, tmp_path):
+    generate(env="soadrl", n=1, length=60, out=tmp_path / "d", labels=True)
+    page = Reader(dataset_page(tmp_path / "d").html)
+    (entry,) = page.meta["sequences"]
+    with DatasetFolder(tmp_path / "d") as folder:
+        stored = folder.read("scan_label", 0, 0, entry["rows"])
+    np.testing.assert_array_equal(page.arrays(entry)["scan_label"], stored)
+    assert stored.max() > 2
+    plain = Reader(dataset_page(dataset).html)
+    assert not any("scan_label" in entry["arrays"] for entry in plain.meta["sequences"])
 
 
 def test_imports_have_scan_rings_and_curves(imported):

@@ -21,18 +21,15 @@ from navrep_data.shards import (
     MAX_SHARD_BYTES,
     SPLITS,
     DatasetFolder,
+    DatasetWriter,
     FileEntry,
     Manifest,
     SequenceSource,
     ShardEntry,
-    ShardWriter,
     Worlds,
     check_file,
-    dataset_card,
     dataset_record,
     estimate_bytes,
-    publish,
-    ranges_of,
     take_episodes,
 )
 
@@ -57,7 +54,7 @@ class Piece:
         Rows of the shard.
     episodes : tuple of int
         First episode and the one after the last, counted within the shard.
-    split : str or None
+    split : str
         Split of the sequence there.
     source : SequenceSource
         Where the rows came from in the first place; `dataset` counts in the records of `given`.
@@ -68,7 +65,7 @@ class Piece:
     start: int
     stop: int
     episodes: tuple[int, int]
-    split: str | None
+    split: str
     source: SequenceSource
 
     def columns(self) -> Arrays:
@@ -165,20 +162,24 @@ class Given:
         begins = keep & (new | ~np.append(False, keep[:-1]))
         ends = keep & (np.append(new[1:], True) | ~np.append(keep[1:], False))
         first_of_sequence = np.maximum.accumulate(np.where(new, np.arange(len(e)), 0))
-        first_of_shard = np.searchsorted(e.shard, e.shard, side="left")
+        # episodes are in the order of their sequences, as those of each shard are
+        by_shard = np.argsort(e.shard, kind="stable")
+        in_shard = np.empty(len(e), np.int64)
+        in_shard[by_shard] = np.arange(len(e)) - np.searchsorted(e.shard[by_shard], e.shard[by_shard], side="left")
         result = []
         for i, j in zip(np.flatnonzero(begins).tolist(), np.flatnonzero(ends).tolist(), strict=True):
             sequence, shard = int(e.sequence[i]), int(e.shard[i])
             row = int(e.start[i] - e.start[first_of_sequence[i]])
-            episodes = (i - int(first_of_shard[i]), j + 1 - int(first_of_shard[i]))
+            episodes = (int(in_shard[i]), int(in_shard[j]) + 1)
             start, stop = int(e.start[i]), int(e.start[j] + e.length[j])
-            split = SPLITS[e.split[i]] if e.split[i] >= 0 else None
+            split = SPLITS[e.split[i]]
             result.append(Piece(self, shard, start, stop, episodes, split, self._source(shard, sequence, row)))
         return result
 
     def _source(self, shard: int, sequence: int, row: int) -> SequenceSource:
         entry = self.manifest.shards[shard]
-        k = sequence - entry.sequences[0]
+        k = entry.position(sequence)
+        assert k is not None
         if not entry.source:
             return SequenceSource(0, sequence, row, entry.sequence_hashes[k])
         known = entry.source[k]
@@ -230,7 +231,7 @@ def write_dataset(
     pieces: Sequence[Piece],
     *,
     command: str,
-    splits: Sequence[str | None] | None = None,
+    splits: Sequence[str] | None = None,
     split_rule: str | None = None,
     progress: Progress | None = None,
 ) -> Manifest:
@@ -244,7 +245,7 @@ def write_dataset(
         At least one; their datasets agree in environment, sensor and columns.
     command : str
         For the manifest.
-    splits : sequence of str or None, optional
+    splits : sequence of str, optional
         Split of each piece; that of its sequence by default.
     split_rule : str, optional
         In words; goes with `splits`.
@@ -263,29 +264,17 @@ def write_dataset(
     manifest = _plan(given, pieces, tuple(records.values()), command)
     # position of each record in the new manifest, by its hash
     number = {content: k for k, content in enumerate(records)}
-    entries: list[ShardEntry] = []
-    for first in range(0, len(pieces), manifest.shard_size):
-        mine = pieces[first : first + manifest.shard_size]
-        writer = ShardWriter(
-            env=manifest.env, config=manifest.config, seed=manifest.seed, sensor=manifest.sensor,
-            scan_dtype=manifest.scan_dtype, columns=manifest.columns, max_humans=manifest.max_humans,
-            length=manifest.length, first_sequence=first,
-        )  # fmt: skip
-        for k, piece in enumerate(mine, first):
-            writer.append(*piece.read(k, manifest.max_humans))
-            if progress is not None:
-                progress(k + 1, len(pieces))
-        source = tuple(
-            p.source._replace(dataset=number[p.given.records[p.source.dataset]["content_hash"]]) for p in mine
-        )
-        entries.append(replace(publish(root, len(entries), writer.finish()), source=source))
     chosen = [piece.split for piece in pieces] if splits is None else splits
-    manifest = replace(manifest, split_rule=split_rule or _followed_rule(given)).with_shards(
-        entries, complete=True, splits={s: ranges_of(k for k, c in enumerate(chosen) if c == s) for s in SPLITS}
-    )
+    writer = DatasetWriter(root, replace(manifest, split_rule=split_rule or _followed_rule(given)))
+    for k, (piece, split) in enumerate(zip(pieces, chosen, strict=True)):
+        record = piece.given.records[piece.source.dataset]
+        source = piece.source._replace(dataset=number[record["content_hash"]])
+        writer.append(k, split, *piece.read(k, manifest.max_humans), source=source)
+        if progress is not None:
+            progress(k + 1, len(pieces))
     for one in given:
         one.folder.close()
-    return manifest.save(root, dataset_card(manifest))
+    return writer.finish()
 
 
 def _joined_records(given: Iterable[Given]) -> dict[str, dict[str, Any]]:
@@ -316,6 +305,8 @@ def _plan(
         planned=len(pieces),
         shard_size=_shard_size(m, [p.stop - p.start for p in pieces], max_humans),
         config={key: value for key, value in m.config.items() if key in same},
+        inputs={k: v for k, v in m.inputs.items() if all(o.inputs.get(k) == v for o in all_m)},
+        origins={k: v for k, v in m.origins.items() if all(o.origins.get(k) == v for o in all_m)},
         policy=m.policy if all(o.policy == m.policy for o in all_m) else {"name": "several"},
         versions={"navrep-data": __version__, "numpy": np.__version__, "python": platform.python_version()},
         license=m.license if all(o.license == m.license for o in all_m) else None,

@@ -120,14 +120,13 @@ def split(
     """
     given = Given(root)
     pieces = given.pieces()
-    if shares is None:
-        chosen, rule = [piece.split for piece in pieces], None
-    else:
+    chosen, rule = [piece.split for piece in pieces], None
+    if shares is not None:
         parts = ", ".join(f"{name} {shares.get(name, 0.0):g}" for name in SPLITS)
         chosen, rule = _draw(pieces, shares, seed), f"drawn with seed {seed} from whole source sequences: {parts}"
     options = "" if shares is None else f" --shares {','.join(exact(shares.get(n, 0.0)) for n in SPLITS)} --seed {seed}"
     groups = {name: [p for p, c in zip(pieces, chosen, strict=True) if c == name] for name in SPLITS}
-    check_not_empty([p for group in groups.values() for p in group], f"no sequence of {root} is in a split.")
+    check_not_empty(pieces, f"{root} holds no sequence.")
     total, done = sum(map(len, groups.values())), 0
     made = {}
     with new_folder(out, what="split", apart_from=[given.root]) as part:
@@ -151,7 +150,7 @@ def _shifted(progress: Progress, before: int, total: int) -> Progress:
     return lambda done, _: progress(before + done, total)
 
 
-def _draw(pieces: Sequence[Piece], shares: Mapping[str, float], seed: int) -> list[str | None]:
+def _draw(pieces: Sequence[Piece], shares: Mapping[str, float], seed: int) -> list[str]:
     """Return a split for each piece, the same for pieces of one source sequence."""
     odd = sorted(set(shares) - set(SPLITS))
     if odd:

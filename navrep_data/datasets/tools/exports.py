@@ -174,7 +174,7 @@ def _npz_files(part: Path, given: Given, progress: Progress | None) -> dict[str,
         )
     pieces = given.pieces()
     # files are imported in the order of their names
-    digits = max(MIN_DIGITS, len(str(given.manifest.shards[-1].sequences[1] - 1)))
+    digits = max(MIN_DIGITS, len(str(max(shard.sequences[-1][1] for shard in given.manifest.shards) - 1)))
     for k, piece in enumerate(pieces):
         columns = piece.columns()
         buffer = io.BytesIO()

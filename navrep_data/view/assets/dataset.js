@@ -12,6 +12,12 @@ class Sequence {
   episodeOf(row) { return this.episodes[this.episodeIndex[row]]; }
   scan(row, ray) { return this.arrays.scan.value(row, ray); }
 
+  // What a ray hit, where the dataset has labels: 0 nothing, 1 static, 2 another robot, 3 and more a person.
+  rayColour(row, ray) {
+    const hit = this.arrays.scan_label ? this.arrays.scan_label.value(row, ray) : 0;
+    return hit === 0 ? palette.ray : hit === 1 ? palette['obstacle-edge'] : hit === 2 ? palette.robot : palette.human;
+  }
+
   pose(row) {
     if (!this.world) return [0, 0, 0];
     const p = this.arrays.robot_pose;
@@ -72,8 +78,8 @@ const player = new Player(showRow, () => {
 });
 const whenLoaded = (draw) => (ctx, w, h) => { if (sequence) draw(ctx, w, h); };
 const panels = [
-  new Surface($('polar'), whenLoaded((ctx, w, h) => drawPolar(ctx, w, h, (i) => sequence.scan(player.row, i)))),
-  new Surface($('strip'), whenLoaded((ctx, w, h) => drawStrip(ctx, w, h, (i) => sequence.scan(player.row, i)))),
+  new Surface($('polar'), whenLoaded((ctx, w, h) => drawPolar(ctx, w, h, (i) => sequence.scan(player.row, i), (i) => sequence.rayColour(player.row, i)))),
+  new Surface($('strip'), whenLoaded((ctx, w, h) => drawStrip(ctx, w, h, (i) => sequence.scan(player.row, i), (i) => sequence.rayColour(player.row, i)))),
   new Surface($('rings-canvas'), whenLoaded((ctx, w, h) => {
     if (sequence.arrays.rings) drawRings(ctx, w, h, sequence.arrays.rings, player.row);
     else label(ctx, 'no rings: the scan does not go all around', w / 2, h / 2, 'center');
@@ -209,6 +215,8 @@ function colourTimeline() {
   const counts = OUTCOMES.map((name) => [name, sequence.episodes.filter((e) => known(e.event) === name).length]).filter(([, n]) => n);
   $('outcomes').replaceChildren(...counts.map(([name, n]) => key(outcomeColour(name), `${OUTCOME_LETTER[name]} ${OUTCOME_TEXT[name]} ${n}`)));
   $('rings-legend').replaceChildren(...[['free', 'ring-free'], ['unknown', 'ring-unknown'], ['occupied', 'ring-occupied']].map(([text, c]) => key(palette[c], text)));
+  const hits = sequence.arrays.scan_label ? [['static', 'obstacle-edge'], ['robot', 'robot'], ['person', 'human']] : [];
+  $('scan-legend').replaceChildren(...hits.map(([text, c]) => key(palette[c], text)));
 }
 
 async function loadSequence(index) {

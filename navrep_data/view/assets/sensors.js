@@ -8,7 +8,7 @@ const rayOrder = Array.from({ length: sensor.n_rays }, (_, i) => i).sort((i, j) 
 const RANGE_MARKS = [1, 5, 10, 25, 50, 100];
 const ANGLE_MARKS = [[Math.PI, 'behind', 'left'], [Math.PI / 2, 'left', 'center'], [0, 'ahead', 'center'], [-Math.PI / 2, 'right', 'center'], [-Math.PI, 'behind', 'right']];
 
-function drawPolar(ctx, w, h, scanAt) {
+function drawPolar(ctx, w, h, scanAt, colourAt) {
   const cx = w / 2, cy = h / 2, size = Math.min(w, h) / 2 - 4;
   ctx.lineWidth = 1;
   for (const metres of RANGE_MARKS.filter((m) => m <= sensor.range_max)) {
@@ -23,14 +23,17 @@ function drawPolar(ctx, w, h, scanAt) {
     const r = size * nearness(range > 0 ? range : 0);
     const x = cx + r * Math.cos(angle), y = cy - r * Math.sin(angle);
     ctx.lineTo(x, y);
-    if (range > 0 && range < sensor.range_max) points.push(x, y);
+    if (range > 0 && range < sensor.range_max) points.push([x, y, colourAt(i)]);
   }
   ctx.closePath();
   ctx.globalAlpha = 0.18;
   ctx.fillStyle = palette.ray;
   ctx.fill();
   ctx.globalAlpha = 1;
-  for (let k = 0; k < points.length; k += 2) ctx.fillRect(points[k] - 0.8, points[k + 1] - 0.8, 1.6, 1.6);
+  for (const [x, y, colour] of points) {
+    ctx.fillStyle = colour;
+    ctx.fillRect(x - 0.8, y - 0.8, 1.6, 1.6);
+  }
   ctx.fillStyle = palette.robot;
   ctx.beginPath();
   ctx.moveTo(cx, cy - 6);
@@ -50,7 +53,7 @@ function angleMarks(ctx, x, w, y) {
   for (const [angle, text, align] of ANGLE_MARKS.filter(([angle]) => w > 230 || Math.abs(angle) < (w > 140 ? 3 : 1))) label(ctx, text, Math.min(Math.max(x + w * (0.5 - angle / (2 * Math.PI)), x), x + w), y, align);
 }
 
-function drawStrip(ctx, w, h, scanAt) {
+function drawStrip(ctx, w, h, scanAt, colourAt) {
   const left = 30, bottom = 15, pw = w - left - 4, ph = h - bottom - 4;
   for (const metres of RANGE_MARKS.filter((m) => m <= sensor.range_max)) {
     const y = 4 + ph * (1 - nearness(metres));
@@ -60,10 +63,10 @@ function drawStrip(ctx, w, h, scanAt) {
     label(ctx, metres + ' m', left - 3, y + 4, 'right');
   }
   const bar = Math.max(1, pw * Math.abs(sensor.angle_increment) / (2 * Math.PI));
-  ctx.fillStyle = palette.ray;
   for (const i of rayOrder) {
     const range = scanAt(i);
     if (!(range > 0)) continue;
+    ctx.fillStyle = colourAt(i);
     const x = left + pw * (0.5 - wrap(rayAngle(i)) / (2 * Math.PI)), y = 4 + ph * (1 - nearness(range));
     ctx.globalAlpha = 0.2;
     ctx.fillRect(x, y, bar, 4 + ph - y);

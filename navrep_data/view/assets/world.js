@@ -37,14 +37,17 @@ class World {
       const reach = range > 0 ? range : 0;
       const x = c.x(pose[0] + reach * Math.cos(angle)), y = c.y(pose[1] + reach * Math.sin(angle));
       ctx.lineTo(x, y);
-      if (range > 0 && range < sensor.range_max) points.push(x, y);
+      if (range > 0 && range < sensor.range_max) points.push([x, y, s.rayColour(row, i)]);
     }
     ctx.closePath();
     ctx.fillStyle = palette.ray;
     ctx.globalAlpha = 0.13;
     ctx.fill();
     ctx.globalAlpha = 1;
-    for (let k = 0; k < points.length; k += 2) ctx.fillRect(points[k] - 1, points[k + 1] - 1, 2, 2);
+    for (const [x, y, colour] of points) {
+      ctx.fillStyle = colour;
+      ctx.fillRect(x - 1, y - 1, 2, 2);
+    }
   }
 
   drawPolygons(ctx, s, episode) {

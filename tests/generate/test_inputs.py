@@ -1,7 +1,8 @@
-"""Own maps of datasets: found again from other folders, and refused where they are not what the dataset was made on."""
+"""Maps and policies of datasets: found again from other folders, and refused where they are not what they were."""
 
 from __future__ import annotations
 
+import hashlib
 import pickle
 import shutil
 from pathlib import Path
@@ -12,6 +13,8 @@ from PIL import Image
 
 from navrep_data.errors import DatasetMismatchError, MapError
 from navrep_data.generate import generate, merge_manifest, regenerate
+from navrep_data.generate.inputs import check_here, inputs_of
+from navrep_data.generate.policy import PolicySpec
 from navrep_data.shards import Manifest
 from navrep_data.sim import load_map, make_config
 from navrep_data.sim.map_tables import map_world_data
@@ -46,7 +49,7 @@ def test_a_dataset_is_not_extended_on_an_edited_map(here: Path) -> None:
     generate(n=1, out="../d", maps=["./m"], **SETTINGS)
     before = (here / "d" / "manifest.json").read_bytes()
     draw(here / "a" / "m", wall=9)
-    with pytest.raises(DatasetMismatchError, match=r"made on a map 'map' with content \w{12}, asked for .*edited"):
+    with pytest.raises(DatasetMismatchError, match=r"made on a map '\.\./a/m' with content \w{12}, asked for .*edited"):
         generate(n=2, out="../d", maps=["./m"], **SETTINGS)
     with pytest.raises(DatasetMismatchError, match="has been edited, or is another one"):
         regenerate("../d", 1)
@@ -58,8 +61,50 @@ def test_parts_made_on_two_maps_are_not_merged(here: Path) -> None:
     generate(n=2, out="p", maps=["./m"], shard_range="0/2", **SETTINGS)
     draw(here / "a" / "m", wall=9)
     generate(n=2, out="p", maps=["./m"], shard_range="1/2", **SETTINGS)
-    with pytest.raises(DatasetMismatchError, match=r"Part 1/2 was made on another map 'map'.* than part 0/2"):
+    with pytest.raises(DatasetMismatchError, match=r"Part 1/2 was made with inputs.map:\.\./m=\w{32}, part 0/2 with"):
         merge_manifest("p")
+
+
+POLICY = "import numpy as np\n\n\ndef drive(scan, state):\n    return np.full((len(scan), 2), {speed})\n"
+
+
+def test_a_dataset_is_not_extended_by_an_edited_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    settings = {"policy": "edited_later:drive", "policy_batch": 1, "humans": 1, "length": 4, "shard_size": 1}
+    module = tmp_path / "edited_later.py"
+    module.write_text(POLICY.format(speed=0.5))
+    generate(n=1, out="d", **settings)
+    assert Manifest.read("d").inputs == {"policy": hashlib.sha256(module.read_bytes()).hexdigest()}
+    assert regenerate("d", 1).ok
+    generate(n=2, out="p", shard_range="0/2", **settings)
+    before = (tmp_path / "d" / "manifest.json").read_bytes()
+    module.write_text(POLICY.format(speed=0.25))
+    words = r"made by edited_later:drive with content \w{12}, which is \w{12} now: the policy has been edited"
+    with pytest.raises(DatasetMismatchError, match=words):
+        generate(n=2, out="d", **settings)
+    with pytest.raises(DatasetMismatchError, match=words):
+        regenerate("d", 1)
+    assert (tmp_path / "d" / "manifest.json").read_bytes() == before
+    generate(n=2, out="p", shard_range="1/2", **settings)
+    with pytest.raises(DatasetMismatchError, match=r"Part 1/2 was made with inputs.policy=\w{64}, part 0/2 with"):
+        merge_manifest("p")
+
+
+@pytest.mark.parametrize("what", ["map", "policy"])
+def test_workers_compare_what_they_find(here: Path, what: str) -> None:
+    """A node may have another map at the same path, or another module."""
+    config = make_config("map", maps=("./m",), humans=0)
+    policy = PolicySpec("drives:drive", 1, lambda scan, state: np.zeros((len(scan), 2)))
+    began = inputs_of(config, policy)
+    assert set(began) == {"map:./m", "policy"}
+    check_here(began, config, policy, "here")
+    if what == "map":
+        draw(here / "a" / "m", wall=9)
+    else:
+        began["policy"] = "0" * 64
+    with pytest.raises(DatasetMismatchError, match=rf"The {what} .* has content \w{{12}} on node x, but the run began"):
+        check_here(began, config, policy, "on node x")
 
 
 @pytest.mark.slow
