@@ -62,3 +62,15 @@ def released() -> Path:
     if not (AUTHORS / "models" / "gym").is_dir():
         pytest.skip("needs the authors' weights: let NAVREP_RELEASED_DIR name a checkout of their repository")
     return AUTHORS
+
+
+@pytest.fixture
+def maps() -> list[str]:
+    """The names of the paper's maps, which an extra installs."""
+    from navrep_data.errors import MissingExtraError
+    from navrep_data.sim import map_names
+
+    try:
+        return map_names()
+    except MissingExtraError as missing:
+        pytest.skip(str(missing))

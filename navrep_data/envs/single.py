@@ -191,7 +191,7 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _info(self) -> dict[str, Any]:
         humans = self._worlds.humans()[0]
         if not self._pad_humans:
-            humans = humans[: int(self._worlds.human_counts()[0])]
+            humans = humans[: int(self._worlds.sim.human_counts()[0])]
         info: dict[str, Any] = {
             "robot": self._worlds.robots()[0],
             "humans": humans,
@@ -223,7 +223,7 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         if self._scan is None:
             raise gymnasium.error.ResetNeeded("There is nothing to draw before the first reset().")
-        state, grid = self._worlds.sim.state(), self._worlds.grid(0)
+        state, grid = self._worlds.sim.state(), self._worlds.sim.grid()
         self._camera = Camera.around(state, grid) if self._camera is None else self._camera.following(state, grid)
         return draw_frame(state, self._camera, self._scan, self.config.sensor, self._trail, grid, size)
 

@@ -321,7 +321,7 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         if not self._running:
             raise gymnasium.error.ResetNeeded("There is nothing to draw before the first reset().")
         world = self._number(world)
-        state, grid = self._worlds.sim.state(world), self._worlds.grid(world)
+        state, grid = self._worlds.sim.state(world), self._worlds.sim.grid(world)
         if self._scans is not None:
             scan = self._scans[world]
         else:

@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from navrep_data.errors import ConfigError, check_whole
 from navrep_data.schema import ACTION_SIZE, ROBOT_STATE_SIZE, Event
 from navrep_data.sim import SimConfig, Simulator, make_config, numpy_seed, scale_actions
-from navrep_data.sim import _layout as lay
-from navrep_data.sim.gridmap import GridMap
 from navrep_data.sim.simulator import MAX_NUMPY_SEED, MAX_SEED
 
 F32 = NDArray[np.float32]
@@ -26,10 +24,6 @@ EVENT_LABELS = np.array([event.label for event in Event], object)
 TERMINAL = np.array([event.terminal for event in Event])
 # Goals and starts lie within this of each other [m]; a robot that drives away may get further.
 _WORLD_SIZE = 1000.0
-_POSE = [lay.A_X, lay.A_Y, lay.A_HEADING]
-# x, y, vx, vy lie side by side: slices are copied several times faster than columns by number
-_MOTION = slice(lay.A_X, lay.A_VY + 1)
-assert (lay.A_X, lay.A_Y, lay.A_VX, lay.A_VY) == (0, 1, 2, 3)
 
 
 def make_env_config(env: str | SimConfig, **changes: Any) -> SimConfig:
@@ -237,39 +231,23 @@ class Worlds:
 
     def robots(self) -> F64:
         """Return x, y [m], theta [rad] of the robots, (n, 3) or (n, robots, 3), on maps in the frame of the file."""
-        poses = self.drawn_robots()
-        poses[:, :, :2] += self.sim.origins[:, None]
-        return poses if self._lead else poses[:, 0]
+        poses = self.sim.poses()
+        poses[..., :2] += self.sim.origins.reshape(self.n, *(1 for _ in self._lead), 2)
+        return poses
 
     def drawn_robots(self) -> F64:
         """Return x, y [m], theta [rad] of the robots, (n, robots, 3), in the frame of the simulator's states."""
-        agents: F64 = self.sim.arrays.agents
-        return agents[:, : self.config.robots, _POSE]
+        return self.sim.poses().reshape(self.n, self.config.robots, 3)
 
     def humans(self) -> F64:
         """Return x, y [m], vx, vy [m/s] of the humans, (n, most humans, 4), as :meth:`robots`; NaN in empty slots."""
-        first = self.config.robots
-        agents: F64 = self.sim.arrays.agents
-        out = agents[:, first:, _MOTION].copy()
+        out = self.sim.human_motions()
         out[..., :2] += self.sim.origins[:, None]
-        out[np.arange(out.shape[1]) >= self.human_counts()[:, None]] = np.nan
         return out
 
     def scenarios(self) -> NDArray[np.int64]:
         """Return which of the config's scenarios are played, (n,) indices; nothing where there are none."""
-        if self.sim.maps is None or not self._scenarios:
-            return np.zeros(0, np.int64)
-        return self.sim.maps.scenarios_played()
-
-    def grid(self, world: int) -> GridMap | None:
-        """Return the map that a world is on, None where there is none."""
-        maps = self.sim.maps
-        return None if maps is None else maps.data.maps[maps.map_index(world)]
-
-    def human_counts(self) -> NDArray[np.int64]:
-        """Return the number of humans in each world, (n,)."""
-        scalars: F64 = self.sim.arrays.scalars
-        return scalars[:, lay.S_HUMANS].astype(np.int64)
+        return self.sim.scenarios_played() if self._scenarios else np.zeros(0, np.int64)
 
 
 def _has_numbers(env: str) -> bool:

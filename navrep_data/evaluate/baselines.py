@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from navrep_data.evaluate import _dwa
 from navrep_data.evaluate.pilots import Pilot
-from navrep_data.evaluate.worlds import Worlds
+from navrep_data.evaluate.suite_worlds import SuiteWorlds
 from navrep_data.observations import fill_blind
 
 F64 = NDArray[np.float64]
@@ -27,7 +27,7 @@ class GoalPilot(Pilot):
     sees = "goal only"
     text = "straight to the goal"
 
-    def act(self, worlds: Worlds) -> F64:
+    def act(self, worlds: SuiteWorlds) -> F64:
         """Return actions (W, 3)."""
         return _box(worlds.robot_states()[:, :2].astype(np.float64))
 
@@ -42,12 +42,12 @@ class RandomPilot(Pilot):
     def __init__(self) -> None:
         self._streams: dict[int, np.random.Generator] = {}
 
-    def start(self, worlds: Worlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
+    def start(self, worlds: SuiteWorlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
         """Give every new episode a stream of its own."""
         for w in np.flatnonzero(mask):
             self._streams[int(w)] = np.random.default_rng([int(episodes[w]), 20_200_916])
 
-    def act(self, worlds: Worlds) -> F64:
+    def act(self, worlds: SuiteWorlds) -> F64:
         """Return actions (W, 3)."""
         actions = np.zeros((worlds.n, 3))
         for w, stream in self._streams.items():
@@ -63,7 +63,7 @@ class OrcaPilot(Pilot):
     sees_on_maps = "true humans, map"
     text = "ORCA among all humans and obstacles"
 
-    def act(self, worlds: Worlds) -> F64:
+    def act(self, worlds: SuiteWorlds) -> F64:
         """Return actions (W, 3)."""
         actions = np.zeros((worlds.n, 3))
         actions[:, :2] = _to_robot_frame(worlds.orca(), worlds.poses()[:, 2]) / worlds.speed()
@@ -113,7 +113,7 @@ class DwaPilot(Pilot):
         self._settings[_dwa.D_CLEARANCE] = clearance
         self._settings[[_dwa.D_WEIGHT_PROGRESS, _dwa.D_WEIGHT_CLEARANCE, _dwa.D_WEIGHT_SPEED]] = weights
 
-    def act(self, worlds: Worlds) -> F64:
+    def act(self, worlds: SuiteWorlds) -> F64:
         """Return actions (W, 3)."""
         s, sensor = self._settings, worlds.sensor
         s[_dwa.D_MAX_SPEED] = worlds.speed()

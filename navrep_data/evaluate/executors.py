@@ -14,6 +14,7 @@ from navrep_data._ray import RayCluster
 from navrep_data.errors import NavrepDataError, WorkerDiedError
 from navrep_data.evaluate.policies import PilotSpec
 from navrep_data.evaluate.runner import Episode, n_worlds, play, units
+from navrep_data.evaluate.suite_worlds import SuiteWorlds
 from navrep_data.evaluate.suites import Suite, get_suite
 from navrep_data.io import translate_os_error, without_interrupts
 
@@ -59,7 +60,7 @@ class Job:
 def _start(job: Job, suite: Suite, take: Any, count: int) -> Generator[list[Episode]]:
     with job.pilot.in_its_way():
         pilot = job.pilot.make(suite.first_seed)
-        worlds = suite.make(suite.config(job.physics), n_worlds(pilot, job.batch, count))
+        worlds = SuiteWorlds(suite.config(job.physics), n_worlds(pilot, job.batch, count))
         yield from play(suite, worlds, pilot, take)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from navrep_data.errors import PolicyError
-from navrep_data.evaluate.worlds import Worlds
+from navrep_data.evaluate.suite_worlds import SuiteWorlds
 from navrep_data.schema import ACTION_SIZE
 from navrep_data.sim.driving import listens, policy_for
 
@@ -49,12 +49,12 @@ class Pilot(ABC):
     max_worlds: int | None = None
     grouped: bool = False
 
-    def start(self, worlds: Worlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
+    def start(self, worlds: SuiteWorlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
         """Begin the numbered episodes (W,) in the worlds of `mask` (W,)."""
         return
 
     @abstractmethod
-    def act(self, worlds: Worlds) -> F64:
+    def act(self, worlds: SuiteWorlds) -> F64:
         """Return the actions of all worlds (W, 3), in [-1, 1] where they are not to be clipped."""
 
     def observe(self, executed: F64) -> None:
@@ -86,7 +86,7 @@ class FunctionPilot(Pilot):
         self._observe: Callable[[Any], Any] | None = getattr(function, "observe", None)
         self._started = False
 
-    def start(self, worlds: Worlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
+    def start(self, worlds: SuiteWorlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
         """Tell a function with memory where episodes begin."""
         if self._reset is None:
             return
@@ -97,7 +97,7 @@ class FunctionPilot(Pilot):
         rows[: len(mask)] = mask
         self._reset(mask=rows)
 
-    def act(self, worlds: Worlds) -> F64:
+    def act(self, worlds: SuiteWorlds) -> F64:
         """Return actions (W, 3)."""
         actions = np.asarray(self._function(_fill_up(worlds.scans()), _fill_up(worlds.robot_states())), np.float64)
         if actions.shape not in ((BLOCK, 2), (BLOCK, ACTION_SIZE)):
@@ -148,7 +148,7 @@ class ZooPilot(FunctionPilot):
         self._policy, self._function, self._reset = policy, policy.act, policy.reset
         self._observe = policy.observe if listens(policy) else None
 
-    def start(self, worlds: Worlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
+    def start(self, worlds: SuiteWorlds, mask: NDArray[np.bool_], episodes: NDArray[np.int64]) -> None:
         """Clear the memory of new episodes, and start the noise of a group."""
         if self._scaling == "robot":
             fitting = policy_for(self._policy, worlds.robot)

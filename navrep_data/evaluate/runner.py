@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from navrep_data.errors import SimulationError
 from navrep_data.evaluate.metrics import Contacts, measure
 from navrep_data.evaluate.pilots import BLOCK, Pilot
+from navrep_data.evaluate.suite_worlds import SuiteWorlds
 from navrep_data.evaluate.suites import Suite
-from navrep_data.evaluate.worlds import Worlds
 from navrep_data.schema import Event
 from navrep_data.sim import Touches
 
@@ -85,7 +85,7 @@ class _ContactCounter:
 class _Recorder:
     """The paths of the episodes that are being played."""
 
-    def __init__(self, worlds: Worlds, max_steps: int) -> None:
+    def __init__(self, worlds: SuiteWorlds, max_steps: int) -> None:
         self.worlds = worlds
         self.paths = np.zeros((worlds.n, max_steps + 1, 4))  # x, y, gap to humans, gap to obstacles
         self.steps = np.zeros(worlds.n, np.int64)
@@ -148,7 +148,7 @@ def units(episodes: list[int], grouped: bool) -> list[list[int]]:
     return list(groups.values())
 
 
-def play(suite: Suite, worlds: Worlds, pilot: Pilot, take: Take) -> Iterator[list[Episode]]:
+def play(suite: Suite, worlds: SuiteWorlds, pilot: Pilot, take: Take) -> Iterator[list[Episode]]:
     """Play episodes until there are none left, and yield those that a step has finished.
 
     Parameters
@@ -186,7 +186,9 @@ def play(suite: Suite, worlds: Worlds, pilot: Pilot, take: Take) -> Iterator[lis
         playing[ended] = -1
 
 
-def _refill(suite: Suite, worlds: Worlds, pilot: Pilot, recorder: _Recorder, playing: NDArray[Any], take: Take) -> bool:
+def _refill(
+    suite: Suite, worlds: SuiteWorlds, pilot: Pilot, recorder: _Recorder, playing: NDArray[Any], take: Take
+) -> bool:
     """Start the next episodes in free worlds; returns False once there are none left."""
     free = np.flatnonzero(playing < 0)
     if len(free) == 0 or (pilot.grouped and len(free) < worlds.n):

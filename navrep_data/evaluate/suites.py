@@ -9,8 +9,6 @@ from functools import cache
 from typing import Any
 
 from navrep_data.errors import ConfigError, UnknownNameError, check_whole, did_you_mean
-from navrep_data.evaluate.map_worlds import ScenarioWorlds
-from navrep_data.evaluate.worlds import PolygonWorlds, Worlds
 from navrep_data.io import json_bytes
 from navrep_data.registration import spelled
 from navrep_data.sim import SimConfig, make_config
@@ -58,8 +56,6 @@ class Suite:
         More than any episode has.
     config : callable
         ``config(physics)`` returns the simulator's.
-    make : callable
-        ``make(config, n)`` returns n :class:`Worlds`.
     data_hash : callable
         Returns the hash of scenario data and maps, empty where everything is in the config.
     """
@@ -73,7 +69,6 @@ class Suite:
     first_seed: int
     max_steps: int
     config: Callable[[str], SimConfig]
-    make: Callable[[SimConfig, int], Worlds]
     data_hash: Callable[[], str]
 
     @property
@@ -146,7 +141,6 @@ NAVREPTEST = Suite(
     first_seed=1000,
     max_steps=180,
     config=_test_config,
-    make=PolygonWorlds,
     data_hash=str,
 )
 
@@ -177,7 +171,6 @@ NAVREP27 = Suite(
     first_seed=0,
     max_steps=1001,
     config=_ian_config,
-    make=ScenarioWorlds,
     data_hash=_scenario_hash,
 )
 

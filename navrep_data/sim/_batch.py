@@ -4,9 +4,18 @@
 import numpy as np
 
 from navrep_data.kernels import kernel
-from navrep_data.sim._layout import F_ROBOTS, S_EPISODE, S_HUMANS
+from navrep_data.sim._geometry import swept_clearance
+from navrep_data.sim._layout import A_RADIUS, A_X, A_Y, F_ROBOTS, S_EPISODE, S_HUMANS, S_OBST_ROBOT, S_POLYGONS
 from navrep_data.sim._rng import seed_mt, seed_philox
-from navrep_data.sim._step import observe_humans, observe_scan, observe_state, reset_world, step_world
+from navrep_data.sim._step import (
+    observe_humans,
+    observe_scan,
+    observe_state,
+    orca_choice,
+    pack_orca,
+    reset_world,
+    step_world,
+)
 
 
 @kernel
@@ -105,3 +114,38 @@ def observe_others(agents, scalars, hits, flags, out):
         for r in range(robots):
             k = w * robots + r
             observe_humans(r, agents[w], robots, int(scalars[w, S_HUMANS]), hits[k], out[k])
+
+
+@kernel
+def gap_to_others(agents, n_agents):
+    """Return the gap between the first robot's disc and the nearest of rows 1 to n_agents - 1 [m], infinity if none."""
+    best = np.inf
+    for i in range(1, n_agents):
+        distance = np.hypot(agents[i, A_X] - agents[0, A_X], agents[i, A_Y] - agents[0, A_Y])
+        best = min(best, distance - agents[i, A_RADIUS] - agents[0, A_RADIUS])
+    return best
+
+
+@kernel
+def measure_gaps(agents, scalars, edges, polygon_start, flags, to_agent, to_static):
+    """Fill to_agent (W,) and to_static (W,) with the gaps around the first robots [m]."""
+    for w in range(agents.shape[0]):
+        to_agent[w] = gap_to_others(agents[w], flags[F_ROBOTS] + int(scalars[w, S_HUMANS]))
+        x, y = agents[w, 0, A_X], agents[w, 0, A_Y]
+        n = int(scalars[w, S_POLYGONS])
+        to_static[w] = swept_clearance(x, y, x, y, edges[w], polygon_start[w], n) - agents[w, 0, A_RADIUS]
+
+
+@kernel
+def choose_orca_robots(agents, agents32, scalars, obst_f, obst_i, flags, orca_params, work_f, work_i, out):
+    """Fill out (W, 2) with the velocity that ORCA chooses for the first robots [m/s]; they see all others."""
+    robots = flags[F_ROBOTS]
+    for w in range(agents.shape[0]):
+        n = int(scalars[w, S_HUMANS])
+        pack_orca(agents[w], robots + n, agents32)
+        vx, vy = orca_choice(
+            0, agents[w], agents32, robots, n, obst_f[w, -1], obst_i[w, -1], int(scalars[w, S_OBST_ROBOT]),
+            orca_params, work_f, work_i,
+        )  # fmt: skip
+        out[w, 0] = vx
+        out[w, 1] = vy

@@ -4,12 +4,14 @@
 import numpy as np
 
 from navrep_data.kernels import kernel
+from navrep_data.sim._batch import gap_to_others
+from navrep_data.sim._ian_contact import CLEARANCE_REACH, swept_cells
 from navrep_data.sim._ian_layout import M_MAP, M_SEEDED, R_ROBOTS
-from navrep_data.sim._ian_orca import way_point
+from navrep_data.sim._ian_orca import guided_velocity, pack_agents, way_point
 from navrep_data.sim._ian_reset import reset_map_world
 from navrep_data.sim._ian_scan import scan_map_world, state_on_map
 from navrep_data.sim._ian_step import step_map_world
-from navrep_data.sim._layout import S_EVENT
+from navrep_data.sim._layout import A_CLEAR_HUMAN, A_CLEAR_STATIC, A_RADIUS, A_X, A_Y, S_EVENT, S_HUMANS, S_STEP
 
 
 @kernel
@@ -83,3 +85,34 @@ def ways_ahead(worlds, maps, path, out):
             worlds.agents[w], worlds.walkers[w], 0, maps, worlds.own_field[w], map_row, worlds.rng[w], path
         )
         out[w, 0], out[w, 1] = x, y
+
+
+@kernel
+def measure_map_gaps(worlds, maps, rules, to_agent, to_static):
+    """Fill to_agent (W,) and to_static (W,) with the smallest gaps around the first robots during the last step [m].
+
+    Before the first step they are those of the start. To static matter they are exact up to a metre, beyond that lower
+    bounds.
+    """
+    for w in range(to_agent.shape[0]):
+        agents = worlds.agents[w]
+        if worlds.scalars[w, S_STEP] > 0:
+            to_agent[w], to_static[w] = agents[0, A_CLEAR_HUMAN], agents[0, A_CLEAR_STATIC]
+            continue
+        to_agent[w] = gap_to_others(agents, int(rules[R_ROBOTS]) + int(worlds.scalars[w, S_HUMANS]))
+        x, y, radius = agents[0, A_X], agents[0, A_Y], agents[0, A_RADIUS]
+        map_row = maps.table[int(worlds.place[w, M_MAP])]
+        to_static[w] = swept_cells(maps, map_row, x, y, x, y, radius + CLEARANCE_REACH) - radius
+
+
+@kernel
+def choose_guided_robots(worlds, maps, rules, orca, path, out):
+    """Fill out (W, 2) with the velocity that ORCA chooses for the first robots along their planned way [m/s]."""
+    for w in range(out.shape[0]):
+        n = int(rules[R_ROBOTS]) + int(worlds.scalars[w, S_HUMANS])
+        pack_agents(worlds.agents[w], n, orca)
+        map_row = maps.table[int(worlds.place[w, M_MAP])]
+        out[w, 0], out[w, 1] = guided_velocity(
+            worlds.agents[w], worlds.walkers[w], 0, 1, n, -1, worlds.place[w], worlds.own_field[w], maps, map_row, orca,
+            worlds.rng[w], path,
+        )  # fmt: skip

@@ -21,17 +21,13 @@ import math
 import numpy as np
 
 from navrep_data.kernels import kernel
+from navrep_data.sim.gait import LEG_RADIUS, LEGS_PER_HUMAN, leg_offset
 
 # Columns of `circles`.
 CIRCLE_X, CIRCLE_Y, CIRCLE_RADIUS, CIRCLE_OWNER = 0, 1, 2, 3
 CIRCLE_COLUMNS = 4
 # Rows of `directions`.
 COSINE, SINE = 0, 1
-
-LEG_RADIUS = 0.03
-LEGS_PER_HUMAN = 2
-# Gait of the original (CMap2D.pyx): stride amplitude per m/s, its bounds, and the sideways amplitude [m].
-STRIDE_PER_SPEED, STRIDE_MIN, STRIDE_MAX, SIDE_AMPLITUDE = 0.6, 0.01, 0.3, 0.1
 
 # Edges whose line passes the sensor this closely [m] are seen edge-on, or the sensor lies on them.
 EDGE_ON = 1e-9
@@ -322,16 +318,8 @@ def scan_poses(edges, poly_start, circles, poses, directions, angle_min, angle_i
 
 @kernel
 def leg_circles(x, y, heading, speed, gait_x, gait_y, gait_theta, owner, rows):
-    """Write the two legs of a walking human.
-
-    x, y, heading [m, m, rad], world frame; speed [m/s]; gait_x, gait_y, gait_theta: way walked in the human's
-    own frame and angle turned since the episode began [m, m, rad]; rows (2, 4) float64 out, as in `circles`.
-    """
-    stride = min(max(STRIDE_PER_SPEED * speed, STRIDE_MIN), STRIDE_MAX)
-    forward = stride * math.cos(2.0 * gait_x / stride + gait_theta)
-    side = SIDE_AMPLITUDE + SIDE_AMPLITUDE * math.cos(2.0 * gait_y / SIDE_AMPLITUDE + gait_theta)
-    ch, sh = math.cos(heading), math.sin(heading)
-    dx, dy = ch * forward - sh * side, sh * forward + ch * side
+    """Write the two legs of a human at x, y [m] into rows (2, 4), as in `circles`; the rest as for `leg_offset`."""
+    dx, dy = leg_offset(heading, speed, gait_x, gait_y, gait_theta)
     rows[0, CIRCLE_X], rows[0, CIRCLE_Y] = x + dx, y + dy
     rows[1, CIRCLE_X], rows[1, CIRCLE_Y] = x - dx, y - dy
     for leg in range(LEGS_PER_HUMAN):

@@ -195,6 +195,16 @@ class MapWorlds:
         _ian_batch.ways_ahead(self.arrays.worlds, self.data.tables, self.arrays.path, out)
         return out
 
+    def gaps(self, to_agent: F64, to_static: F64) -> None:
+        """Fill (W,) each with the gaps around the first robots [m]; see :meth:`Simulator.gaps`."""
+        a = self.arrays
+        _ian_batch.measure_map_gaps(a.worlds, self.data.tables, a.rules, to_agent, to_static)
+
+    def orca_velocities(self, out: F64) -> None:
+        """Fill out (W, 2) with the velocities that ORCA chooses for the first robots along their planned way [m/s]."""
+        a = self.arrays
+        _ian_batch.choose_guided_robots(a.worlds, self.data.tables, a.rules, a.orca, a.path, out)
+
     def clearance(self, points: F64, world: int) -> F64:
         """Return the distances of points (N, 2) to solid cells or the map's edge [m]."""
         row = self.data.tables.table[int(self.arrays.worlds.place[world, il.M_MAP])]

@@ -19,6 +19,7 @@ from navrep_data.sim._lidar import CIRCLE_COLUMNS
 from navrep_data.sim._obstacles import OF_FIELDS, OI_FIELDS
 from navrep_data.sim._orca import make_orca_work
 from navrep_data.sim.config import SimConfig, kernel_flags, kernel_params, orca_params
+from navrep_data.sim.gridmap import GridMap
 from navrep_data.sim.lidar import ray_directions
 from navrep_data.sim.map_worlds import MapWorlds
 from navrep_data.sim.orca import check_near_zero
@@ -487,6 +488,91 @@ class Simulator:
         out = np.zeros((self.n_worlds * self.config.robots, self.config.max_others, len(HUMAN_FIELDS)), np.float32)
         _batch.observe_others(a.agents, a.scalars, a.hits, a.flags, out)
         return out.reshape(self.n_worlds, *self._per_robot, *out.shape[1:])
+
+    def _robots(self, columns: int | list[int]) -> F64:
+        """Return columns of the robots, (W, ...), with R > 1 robots (W, R, ...)."""
+        found: F64 = self.arrays.agents[:, : self.config.robots][:, :, columns]
+        return found if self._per_robot else found[:, 0]
+
+    def poses(self) -> F64:
+        """Return x, y [m], theta [rad] of the robots, (W, 3), in the frame of :meth:`state`; with R > 1 (W, R, 3)."""
+        return self._robots([lay.A_X, lay.A_Y, lay.A_HEADING])
+
+    def goals(self) -> F64:
+        """Return x, y [m] of the robots' goals, (W, 2), in the frame of :meth:`state`; with R > 1 robots (W, R, 2)."""
+        return self._robots([lay.A_GX, lay.A_GY])
+
+    def radii(self) -> F64:
+        """Return the robots' radii [m], (W,); with R > 1 robots (W, R)."""
+        return self._robots(lay.A_RADIUS).copy()
+
+    def human_counts(self) -> NDArray[np.int64]:
+        """Return the number of humans in each world, (W,)."""
+        counts: NDArray[np.int64] = self.arrays.scalars[:, lay.S_HUMANS].astype(np.int64)
+        return counts
+
+    def human_motions(self) -> F64:
+        """Return x, y [m], vx, vy [m/s] of the humans, in the frame of :meth:`state`; NaN in empty slots.
+
+        Returns
+        -------
+        ndarray of shape (W, most humans, 4)
+        """
+        # x, y, vx, vy lie side by side: slices are copied several times faster than columns by number
+        out: F64 = self.arrays.agents[:, self.config.robots :, lay.A_X : lay.A_VY + 1].copy()
+        out[np.arange(out.shape[1]) >= self.human_counts()[:, None]] = np.nan
+        return out
+
+    def gaps(self) -> tuple[F64, F64]:
+        """Return the gaps between the first robots' edges and the nearest other agent and static matter [m], both (W,).
+
+        Negative where they overlap, infinite where there is nobody.
+
+        Notes
+        -----
+        In worlds of polygons they are the present ones. On maps they are the smallest during the last step, and those
+        to static matter are exact up to a metre; beyond that they are lower bounds.
+        """
+        a = self.arrays
+        to_agent, to_static = np.zeros((2, self.n_worlds))
+        if self.maps is not None:
+            self.maps.gaps(to_agent, to_static)
+        else:
+            _batch.measure_gaps(a.agents, a.scalars, a.edges, a.polygon_start, a.flags, to_agent, to_static)
+        return to_agent, to_static
+
+    def orca_velocities(self) -> F64:
+        """Return the velocities that ORCA chooses for the first robots, which see everybody, (W, 2) [m/s].
+
+        In the frame of :meth:`state`. On maps ORCA follows the planned path; elsewhere it heads for the goal.
+        """
+        a = self.arrays
+        out = np.zeros((self.n_worlds, 2))
+        if self.maps is not None:
+            self.maps.orca_velocities(out)
+        else:
+            _batch.choose_orca_robots(
+                a.agents, a.agents32, a.scalars, a.obst_f, a.obst_i, a.flags, a.orca_params, a.work_f, a.work_i, out
+            )
+        return out
+
+    def waypoints(self) -> F64:
+        """Return points for the first robots to head for, (W, 2) [m], in the frame of :meth:`state`.
+
+        On maps about a metre ahead on the planned path; the goals where there is no map.
+        """
+        if self.maps is not None:
+            return self.maps.ways_ahead()
+        goals: F64 = self.arrays.agents[:, 0, [lay.A_GX, lay.A_GY]]
+        return goals
+
+    def scenarios_played(self) -> NDArray[np.int64]:
+        """Return which of the config's scenarios each world plays, (W,) indices; -1 where none."""
+        return np.full(self.n_worlds, -1, np.int64) if self.maps is None else self.maps.scenarios_played()
+
+    def grid(self, world: int = 0) -> GridMap | None:
+        """Return the map that a world is on, None where there is none."""
+        return None if self.maps is None else self.maps.data.maps[self.maps.map_index(world)]
 
     def robot_events(self) -> NDArray[np.uint8]:
         """Return what the last step led to for each robot, (W, R) uint8 event codes."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from navrep_data.sim._lidar import SIDE_AMPLITUDE, STRIDE_MAX, STRIDE_MIN, STRIDE_PER_SPEED
+from navrep_data.sim import gait as gaits
 
 F64 = NDArray[np.float64]
 TWO_PI = 2.0 * np.pi
@@ -87,17 +87,15 @@ def leg_offsets(velocity: F64, start: F64, gait: F64, dt: float, original: bool 
 
     Notes
     -----
-    The simulator's rule (``_step.move_humans``, ``_lidar.leg_circles``) over whole episodes. The column's velocities
+    Gaits are summed up over whole episodes, as the simulator does it (``_step.move_humans``). The column's velocities
     are rounded to 1/1024 m/s, so a human that creeps after a long way may have its legs a few centimetres off.
     """
     heading = headings(velocity, start, original)
     speed = np.hypot(velocity[..., 0], velocity[..., 1])
     walked = speed * dt
     walked[0] = 0.0
-    along = gait[:, 0] + np.cumsum(walked, axis=0)
-    turned = gait[:, 2] + heading - heading[0]
-    stride = np.clip(STRIDE_PER_SPEED * speed, STRIDE_MIN, STRIDE_MAX)
-    forward = stride * np.cos(2.0 * along / stride + turned)
-    side = SIDE_AMPLITUDE * (1.0 + np.cos(2.0 * gait[:, 1] / SIDE_AMPLITUDE + turned))
-    c, s = np.cos(heading), np.sin(heading)
-    return np.stack([c * forward - s * side, s * forward + c * side], axis=-1)
+    walks = np.empty((*speed.shape, 3))
+    walks[..., 0] = gait[:, 0] + np.cumsum(walked, axis=0)
+    walks[..., 1] = gait[:, 1]
+    walks[..., 2] = gait[:, 2] + heading - heading[0]
+    return gaits.leg_offsets(heading, speed, walks)

@@ -113,7 +113,7 @@ def test_walls_at_the_border_of_own_maps_are_whole_or_out_of_sight_and_the_robot
     in_part = False
     for seed in range(6):
         env.reset(seed=seed)
-        left, right, bottom, top = env._worlds.grid(0).extent
+        left, right, bottom, top = env._worlds.sim.grid().extent
         for _ in range(4):
             frame, camera = env.frame(400), env._camera
             x, y = env._worlds.sim.state().robot[:2]

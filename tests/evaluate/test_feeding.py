@@ -11,7 +11,7 @@ from navrep_data.evaluate.policies import PilotSpec, resolve_policy
 from navrep_data.evaluate.reproduce.testing import scores
 from navrep_data.evaluate.results import Results, file_name, header_of
 from navrep_data.evaluate.runner import play
-from navrep_data.evaluate.worlds import PolygonWorlds
+from navrep_data.evaluate.suite_worlds import SuiteWorlds
 from navrep_data.schema import RobotContract, result_name
 from navrep_data.sim import make_config
 from navrep_data.testing import tiny_checkpoint
@@ -45,7 +45,7 @@ class Recording:
 
 
 def drive(policy, scaling="robot", steps=3, **changes):
-    worlds = PolygonWorlds(make_config("navrep-test", physics="original", **changes), 2)
+    worlds = SuiteWorlds(make_config("navrep-test", physics="original", **changes), 2)
     pilot = ZooPilot(policy, 1000, scaling) if isinstance(policy, Recording) else FunctionPilot("f", policy)
     todo = iter([[0], [1]])
     played = play(SUITE, worlds, pilot, lambda: next(todo, None))
@@ -65,7 +65,7 @@ def test_a_function_with_observe_is_told_too():
         __call__ = Recording.act
 
     told = Function()
-    worlds = PolygonWorlds(make_config("navrep-test", physics="original"), 2)
+    worlds = SuiteWorlds(make_config("navrep-test", physics="original"), 2)
     todo = iter([[0], [1]])
     next(play(SUITE, worlds, FunctionPilot("f", told), lambda: next(todo, None)))
     np.testing.assert_allclose(told.told, [[1.0, -0.5, 0.0]])
@@ -187,12 +187,12 @@ def test_a_network_sees_the_office_as_long_as_its_contract(tmp_path, monkeypatch
         return found
 
     monkeypatch.setattr(Policy, "_fitted", spy)
-    from navrep_data.evaluate.map_worlds import ScenarioWorlds
+    from navrep_data.evaluate.suite_worlds import SuiteWorlds
 
     own = tiny_checkpoint(tmp_path / "own")
     suite = get_suite("navrep27")
     pilot = resolve_policy(str(own)).make(0)
-    worlds = ScenarioWorlds(suite.config("original"), 27)
+    worlds = SuiteWorlds(suite.config("original"), 27)
     todo = iter([[k] for k in range(27)])
     next(play(suite, worlds, pilot, lambda: next(todo, None)))
     assert max(seen for seen, _ in farthest) > 30.0

@@ -8,11 +8,12 @@ from scipy.sparse.csgraph import dijkstra
 from navrep_data.evaluate import get_suite, redraw
 from navrep_data.evaluate.baselines import OrcaPilot
 from navrep_data.evaluate.driver import benchmark
-from navrep_data.evaluate.map_worlds import shortest_path
+from navrep_data.evaluate.suite_worlds import SuiteWorlds
 from navrep_data.schema import Event
 from navrep_data.sim import Simulator, scale_actions
 from navrep_data.sim.maps import load_map
 from navrep_data.sim.scenarios import get_scenario, scenario_names
+from navrep_data.sim.shortest_paths import shortest_path
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("maps")]
 
@@ -23,7 +24,7 @@ CHOSEN = [0, 20, 9, 26]
 @pytest.mark.parametrize("physics", ["original", "consistent"])
 def test_worlds_show_what_the_simulator_shows(physics):
     config = SUITE.config(physics)
-    worlds = SUITE.make(config, len(CHOSEN))
+    worlds = SuiteWorlds(config, len(CHOSEN))
     seeds = np.array(CHOSEN) + 27
     worlds.reset(np.ones(len(CHOSEN), bool), seeds, np.array(CHOSEN))
     single = []
@@ -98,7 +99,7 @@ def test_every_scenario_has_a_way():
 
 def test_orca_finds_its_way_where_straight_ahead_does_not_lead_there():
     """irosasl_office_j2: 40 m through an empty office."""
-    worlds = SUITE.make(SUITE.config("original"), 1)
+    worlds = SuiteWorlds(SUITE.config("original"), 1)
     scenario = scenario_names().index("irosasl_office_j2")
     worlds.reset(np.ones(1, bool), np.array([scenario]), np.array([scenario]))
     pilot, event = OrcaPilot(), 0

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from navrep_data.evaluate.worlds import PolygonWorlds
+from navrep_data.evaluate.suite_worlds import SuiteWorlds
 from navrep_data.sim import make_config
 
 
 @pytest.mark.parametrize(("physics", "omega"), [("original", 0.0), ("consistent", 1.0)])
 def test_a_turning_robot_is_shown_as_the_simulator_shows_it(physics, omega):
-    worlds = PolygonWorlds(make_config("navrep-test", physics=physics), 3)
+    worlds = SuiteWorlds(make_config("navrep-test", physics=physics), 3)
     worlds.reset(np.ones(3, bool), np.array([5000, 5001, 5002]), np.zeros(3, np.int64))
     worlds.step(np.tile([0.3, -0.2, 1.0], (3, 1)))
     states = worlds.robot_states()

@@ -74,14 +74,6 @@ def own_cache(tmp_path, monkeypatch):
     return tmp_path / "home" / "maps"
 
 
-@pytest.fixture
-def paper_maps():
-    try:
-        return map_names()
-    except MissingExtraError as missing:
-        pytest.skip(str(missing))
-
-
 def pgm(rows):
     rows = np.asarray(rows, np.uint8)
     return b"P5\n%d %d\n255\n" % (rows.shape[1], rows.shape[0]) + rows.tobytes()
@@ -103,13 +95,13 @@ def write_map(folder, pixels=None, name="map.yaml", raw=None, **changes):
 # --- the paper's maps ---------------------------------------------------------------------------------------------
 
 
-def test_all_of_the_papers_maps_are_there(paper_maps):
-    assert paper_maps == sorted(TABLE)
+def test_all_of_the_papers_maps_are_there(maps):
+    assert maps == sorted(TABLE)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(TABLE))
-def test_the_papers_maps_are_read_as_the_original_reads_them(name, paper_maps):
+def test_the_papers_maps_are_read_as_the_original_reads_them(name, maps):
     columns, rows, resolution, origin, free_threshold, solid, free = TABLE[name]
     grid = load_map(name)
     assert grid.shape == (columns, rows)
@@ -124,14 +116,14 @@ def test_the_papers_maps_are_read_as_the_original_reads_them(name, paper_maps):
 
 
 @pytest.mark.parametrize("name", sorted(REACHABLE))
-def test_reachable_cells_are_those_of_the_original(name, paper_maps):
+def test_reachable_cells_are_those_of_the_original(name, maps):
     coarse = load_map(name).coarsened(3)
     assert coarse.resolution == pytest.approx(8 * TABLE[name][2])
     assert coarse.origin == TABLE[name][3]
     assert int(coarse.reachable((0.0, 0.0), 0.5).sum()) == REACHABLE[name]
 
 
-def test_unknown_ground_collides_or_not_by_the_threshold(paper_maps):
+def test_unknown_ground_collides_or_not_by_the_threshold(maps):
     asl, unity = load_map("asl_office_j"), load_map("unity_scene_map")
     grey = np.isclose(asl.occupancy, 1 - 205 / 254, atol=1e-6)
     assert grey.mean() > 0.5
@@ -142,7 +134,7 @@ def test_unknown_ground_collides_or_not_by_the_threshold(paper_maps):
     assert (unity.signed_distance()[grey] > 0).all()
 
 
-def test_planning_maps_are_as_coarse_as_the_originals(paper_maps):
+def test_planning_maps_are_as_coarse_as_the_originals(maps):
     found = {name: planning_map(load_map(name)).resolution for name in ("asl", "asl_office_j", "unity_scene_map")}
     assert found == {"asl": 0.32, "asl_office_j": 0.16, "unity_scene_map": pytest.approx(0.104)}
     assert 0.1 <= planning_map(load_map("marksimple")).resolution < 0.2
@@ -159,14 +151,14 @@ def test_without_the_extra_the_message_has_the_command(monkeypatch, tmp_path):
     assert load_map("mine").shape == (6, 4)
 
 
-def test_unknown_names_say_what_was_meant(paper_maps):
+def test_unknown_names_say_what_was_meant(maps):
     with pytest.raises(UnknownNameError, match="Did you mean 'asl_office_j'"):
         load_map("asl_ofice_j")
     with pytest.raises(NavrepDataError, match="Unknown map ''"):
         load_map("")
 
 
-def test_the_optional_packages_modules_are_not_imported(paper_maps):
+def test_the_optional_packages_modules_are_not_imported(maps):
     load_map("asl")
     assert not {"pepper_2d_simulator", "pepper_2d_iarlenv", "gymified_pepper_envs"}.intersection(sys.modules)
 
