@@ -12,8 +12,9 @@ import gymnasium
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from navrep_data.envs import NavRepEnv, goal_policy, gymnasium_id
+from navrep_data.envs import NavRepEnv, gymnasium_id
 from navrep_data.errors import MissingExtraError
+from navrep_data.policies import to_goal
 from navrep_data.sim import environment_names
 
 # as in the README's table
@@ -42,7 +43,7 @@ def picture(name: str, physics: str | None, seed: int) -> np.ndarray:
     observation, _ = env.reset(seed=seed)
     frame = world.frame(2 * TILE)
     for _ in range(STEPS):
-        observation, _, terminated, truncated, _ = env.step(goal_policy(observation))
+        observation, _, terminated, truncated, _ = env.step(to_goal(observation["robot_state"]))
         if terminated or truncated:
             break
         frame = world.frame(2 * TILE)

@@ -61,7 +61,7 @@ def main() -> None:
     for k in range(arguments.episodes):
         observation, info = env.reset(seed=k)
         while info["event"] == "none":
-            observation, _, _, _, info = env.step(careful(observation))
+            observation, _, _, _, info = env.step(careful(**observation))
         endings[info["event"]] += 1
     print(", ".join(f"{event} {n}" for event, n in endings.items()))
     if arguments.film:

@@ -13,13 +13,13 @@ from navrep_data.envs import record
 from navrep_data.schema import Event
 
 
-def careful(observation: dict[str, np.ndarray]) -> np.ndarray:
+def careful(scan: np.ndarray, robot_state: np.ndarray) -> np.ndarray:
     """Drive to the goal, pushed aside by what is near.
 
-    Works for one observation and for a batch: scan (..., 1080) [m], robot_state (..., 5) -> action (..., 3) in [-1, 1].
+    Works for one robot and for a batch: scan (..., 1080) [m], robot_state (..., 5) -> action (..., 3) in [-1, 1]. So
+    `navrep-data benchmark own_policy:careful` plays it, and `generate --policy own_policy:careful` records it.
     """
-    scan, state = observation["scan"], observation["robot_state"]
-    goal = state[..., :2] / np.maximum(np.linalg.norm(state[..., :2], axis=-1, keepdims=True), 1.0)
+    goal = robot_state[..., :2] / np.maximum(np.linalg.norm(robot_state[..., :2], axis=-1, keepdims=True), 1.0)
     bearing = np.linspace(0.0, 2 * np.pi, scan.shape[-1], endpoint=False)
     # every ray pushes away from what it hits within 1.5 m, the nearer the stronger
     strength = np.clip(1.5 - scan, 0.0, None) ** 2
@@ -44,7 +44,7 @@ def main() -> None:
     # each world plays the same number of episodes: whoever finishes first must not count more often
     left = np.full(arguments.worlds, -(-arguments.episodes // arguments.worlds))
     while left.any():
-        observations, _, _, _, infos = env.step(careful(observations))
+        observations, _, _, _, infos = env.step(careful(**observations))
         for i in np.flatnonzero(infos.get("_final_info", np.zeros(arguments.worlds, bool)) & (left > 0)):
             endings[Event(infos["final_info"]["event"][i]).label] += 1
             left[i] -= 1

@@ -15,8 +15,8 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from navrep_data.envs import goal_policy
 from navrep_data.observations import Lidar, ScanAdapter, scan_to_rings
+from navrep_data.policies import to_goal
 from navrep_data.schema import SensorContract
 from navrep_data.sim.drawing import draw_rings
 
@@ -45,7 +45,7 @@ def main() -> None:
     adapter = ScanAdapter(Lidar.of(sensor))
     observation, _ = env.reset(seed=1003)
     for _ in range(arguments.steps):
-        observation, _, terminated, truncated, _ = env.step(goal_policy(observation))
+        observation, _, terminated, truncated, _ = env.step(to_goal(observation["robot_state"]))
         if terminated or truncated:
             observation, _ = env.reset()
     full = adapter(observation["scan"])

@@ -31,7 +31,7 @@ def main() -> None:
         total, over, steps = np.zeros(arguments.robots), False, 0
         while not over:
             # scan (robots, 1080), robot_state (robots, 5) -> action (robots, 3)
-            observation, _, terminated, truncated, info = env.step(careful(observation))
+            observation, _, terminated, truncated, info = env.step(careful(**observation))
             total += info["rewards"]
             over, steps = terminated or truncated, steps + 1
         print(f"episode {k}: {info['event']} after {steps} steps; rewards {np.round(total, 1).tolist()}")

@@ -67,11 +67,12 @@ def generate_command(
         str,
         typer.Option(
             "--policy",
-            help="orca, goal-momentum, random-momentum, constant-velocity, or your own module:function.",
+            help="orca, goal-momentum, random-momentum, constant-velocity, or what benchmark takes: goal, dwa, a name "
+            "of the zoo, ./folder, hf://user/name, module:function.",
         ),
     ] = "orca",
     policy_batch: Annotated[
-        int, typer.Option("--policy-batch", help="Batch size that a module:function policy always sees.")
+        int, typer.Option("--policy-batch", help="Batch size that networks and functions always see.")
     ] = 64,
     shard_size: Annotated[
         int | None,

@@ -39,6 +39,10 @@ def play_command(
     ] = None,
     goal: Annotated[str | None, typer.Option("--goal", metavar="X,Y", help="Where it wants to go \\[m].")] = None,
     speed: Annotated[float, typer.Option("--speed", help="1 = real time.")] = 1.0,
+    policy: Annotated[
+        str | None,
+        typer.Option("--policy", help="Who drives while no key is down, as in benchmark.", show_default="nobody"),
+    ] = None,
 ) -> None:
     """Drive the robot by keyboard, where there is a window.
 
@@ -52,5 +56,5 @@ def play_command(
     need_display()
     world = NavRepEnv(env, physics=physics, episode=episode, humans=humans, obstacles=obstacles)
     say_err(HELP)
-    endings = play(world, seed=seed, options=options or None, episodes=episodes, speed=speed, report=say)
+    endings = play(world, seed=seed, options=options or None, episodes=episodes, speed=speed, report=say, policy=policy)
     say(f"{len(endings)} episodes, {endings.count('goal')} at the goal")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from navrep_data.errors import ConfigError, CorruptDataError, HubError, NavrepDataError, OfflineError
-from navrep_data.io import atomic_write_bytes, is_offline, sha256_file, switched_off, translate_os_error
+from navrep_data.io import HUB_SCHEME, atomic_write_bytes, is_offline, sha256_file, switched_off, translate_os_error
 from navrep_data.shards import REPO_NAME, FileEntry
 
 Kind = Literal["dataset", "model"]
@@ -35,7 +35,6 @@ _SLACK = 1 << 20
 _BUSY = frozenset({408, 425, 429, 500, 502, 503, 504})
 _REVISION = re.compile(r"[A-Za-z0-9][A-Za-z0-9._/-]{0,254}")
 COMMIT = re.compile(r"[0-9a-f]{40}")
-HUB_SCHEME = "hf://"
 
 
 class _AgainError(Exception):

@@ -3,7 +3,7 @@
 from typing import Any
 
 from navrep_data.envs.playing import play
-from navrep_data.envs.recording import Recording, goal_policy, record
+from navrep_data.envs.recording import Recording, record
 from navrep_data.envs.single import NavRepEnv
 from navrep_data.envs.vector import NavRepVectorEnv
 from navrep_data.envs.wrappers import (
@@ -28,7 +28,6 @@ __all__ = [
     "VectorFlatObservation",
     "VectorRingsObservation",
     "VectorScan1dObservation",
-    "goal_policy",
     "gymnasium_id",
     "make_sb3_vec",
     "play",

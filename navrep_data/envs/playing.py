@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from navrep_data.envs.single import NavRepEnv
+from navrep_data.envs.wheel import Wheel
 from navrep_data.envs.window import Window, need_display
 from navrep_data.errors import ConfigError
+from navrep_data.policies import AnyPolicy
 
 # Shares of the largest velocities along x (forward), y (left) and of the rotation (left)
 KEYS: dict[str, tuple[float, float, float]] = {
@@ -71,6 +73,7 @@ def play(
     episodes: int | None = None,
     speed: float = 1.0,
     report: Callable[[str], None] = print,
+    policy: AnyPolicy | None = None,
 ) -> list[str]:
     """Let somebody at the keyboard drive the robot.
 
@@ -88,6 +91,8 @@ def play(
         1 = real time.
     report : callable
         Gets one line per episode.
+    policy : str, callable or BasePolicy, optional
+        Who drives instead while no key is down, see :func:`navrep_data.policies.resolve_policy`.
 
     Returns
     -------
@@ -105,7 +110,10 @@ def play(
     keyboard = Keyboard()
     window = Window("navrep-data play", keyboard.on_key, lambda: setattr(keyboard, "quit", True))
     try:
-        return drive(env, keyboard, window, seed=seed, options=options, episodes=episodes, speed=speed, report=report)
+        return drive(
+            env, keyboard, window, seed=seed, options=options, episodes=episodes, speed=speed, report=report,
+            policy=policy,
+        )  # fmt: skip
     finally:
         window.close()
 
@@ -120,6 +128,7 @@ def drive(
     episodes: int | None = None,
     speed: float = 1.0,
     report: Callable[[str], None] = print,
+    policy: AnyPolicy | None = None,
 ) -> list[str]:
     """Do what :func:`play` does, with a keyboard and a window that are there already."""
     world = env.unwrapped
@@ -127,19 +136,27 @@ def drive(
         raise ConfigError(f"{world} cannot be played: expected an environment of navrep-data with one robot.")
     if not 0.01 <= speed <= 100.0:
         raise ConfigError(f"speed is {speed!r}, expected a number from 0.01 to 100.")
+    wheel = None if policy is None else Wheel(world, policy)
     endings: list[str] = []
     places = {name: place for name, place in (options or {}).items() if name in ("start", "goal")} or None
-    env.reset(seed=seed, options=options)
+    _, info = env.reset(seed=seed, options=options)
+    if wheel is not None:
+        wheel.begin(info)
     due = time.monotonic()
     while not keyboard.quit and (episodes is None or len(endings) < episodes):
-        _, _, terminated, truncated, info = env.step(keyboard.action())
+        # a policy is asked in any case: what it remembers goes on where a key takes over
+        chosen = None if wheel is None else wheel.action()
+        pressed = keyboard.action()
+        _, _, terminated, truncated, info = env.step(pressed if chosen is None or pressed.any() else chosen)
         window.show(world.frame())
         if terminated or truncated:
             endings.append(str(info["event"]))
             report(f"episode {len(endings)}: {info['event']}")
         if terminated or truncated or keyboard.restart:
             keyboard.restart = False
-            env.reset(options=places)
+            _, info = env.reset(options=places)
+            if wheel is not None:
+                wheel.begin(info)
         due = max(due + world.config.sensor.dt / speed, time.monotonic())
         window.wait(due - time.monotonic())
     return endings

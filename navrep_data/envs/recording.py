@@ -5,22 +5,20 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from PIL import Image
 
 from navrep_data.envs.single import NavRepEnv
+from navrep_data.envs.wheel import Wheel
 from navrep_data.errors import ConfigError, MissingExtraError
-from navrep_data.sim import RobotPolicy, SimConfig, knows_robots
+from navrep_data.policies import AnyPolicy
 
-Policy = Callable[[Any], ArrayLike]
-"""Takes an observation, returns an action in [-1, 1]."""
 _FORMATS = (".gif", ".mp4")
 # GIF counts hundredths of a second
 _HUNDREDTH = 10
@@ -49,27 +47,9 @@ class Recording:
     total_reward: float
 
 
-def goal_policy(observation: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Drive straight to the goal, more slowly within a metre of it.
-
-    Parameters
-    ----------
-    observation : dict
-        Of a NavRep environment, single or vectorised.
-
-    Returns
-    -------
-    ndarray of shape (..., 3), float32
-        Actions in [-1, 1].
-    """
-    goal = observation["robot_state"][..., :2]
-    velocity = goal / np.maximum(np.linalg.norm(goal, axis=-1, keepdims=True), 1.0)
-    return np.concatenate([velocity, np.zeros((*goal.shape[:-1], 1))], axis=-1).astype(np.float32)
-
-
 def record(
     env: gymnasium.Env[Any, Any],
-    policy: Any,
+    policy: AnyPolicy,
     path: str | os.PathLike[str],
     *,
     seed: int | None = None,
@@ -84,10 +64,10 @@ def record(
     ----------
     env : gymnasium.Env
         A NavRep environment, wrapped or not, of any render mode.
-    policy : callable, or object with ``act(scan, robot_state)``
-        ``policy(observation)`` returns an action in [-1, 1]; an object with ``act``, such as those of the zoo, is
-        reset with ``batch_size=1`` and gets batches of one. The zoo's are told the environment's robot and what it was
-        sent, see :class:`navrep_data.sim.RobotPolicy`.
+    policy : str, callable or BasePolicy
+        Who drives: what :func:`navrep_data.policies.resolve_policy` takes, such as ``"goal"``, a name of the zoo, what
+        :func:`navrep_data.zoo.load` returned, or a function ``(scan, robot_state) -> action`` in [-1, 1] with one row
+        per robot. It sees the environment's own scans, whatever wrappers make of them.
     path : path
         ``.gif``, or ``.mp4`` where imageio-ffmpeg is installed.
     seed, options
@@ -108,24 +88,27 @@ def record(
     ------
     ConfigError
         If `path` has another ending, or `env` is no NavRep environment.
+    UnknownNameError, PolicyError
+        If the policy cannot be used.
     MissingExtraError
         If MP4 is asked for and imageio-ffmpeg is not installed.
 
     Examples
     --------
     >>> import gymnasium
-    >>> from navrep_data.envs import goal_policy, record
+    >>> from navrep_data.envs import record
     >>> env = gymnasium.make("navrep_data:NavRepTest-v0")
-    >>> record(env, goal_policy, "episode.gif", options={"episode": 3}, size=200).event  # doctest: +SKIP
+    >>> record(env, "goal", "episode.gif", options={"episode": 3}, size=200).event  # doctest: +SKIP
     'goal'
     """
     target = Path(path)
     world = _checked(env, target, speed)
-    act = _as_callable(policy, world.config)
-    observation, info = env.reset(seed=seed, options=options)
+    robot = Wheel(world, policy)
+    _, info = env.reset(seed=seed, options=options)
+    robot.begin(info)
     frames, total, steps, over = [world.frame(size)], 0.0, 0, False
     while not over and (max_steps is None or steps < max_steps):
-        observation, reward, terminated, truncated, info = env.step(act(observation))
+        _, reward, terminated, truncated, info = env.step(robot.action())
         frames.append(world.frame(size))
         total, steps, over = total + float(reward), steps + 1, bool(terminated or truncated)
     seconds = world.config.sensor.dt / speed
@@ -145,25 +128,6 @@ def _checked(env: gymnasium.Env[Any, Any], target: Path, speed: float) -> NavRep
     if not isinstance(world, NavRepEnv):
         raise ConfigError(f"{world} cannot be filmed: expected an environment of navrep-data, a single one.")
     return world
-
-
-def _as_callable(policy: Any, config: SimConfig) -> Policy:
-    if not hasattr(policy, "act"):
-        if not callable(policy):
-            raise ConfigError(f"policy is {policy!r}, expected a function of the observation or an object with act().")
-        return policy  # type: ignore[no-any-return]
-    choose = policy.act
-    if knows_robots(policy):
-        policy = RobotPolicy(policy, config)
-        choose = policy.shares
-    if hasattr(policy, "reset"):
-        policy.reset(batch_size=1)
-
-    def act(observation: dict[str, Any]) -> NDArray[Any]:
-        actions = np.asarray(choose(observation["scan"][None], observation["robot_state"][None]))
-        return actions[0, ...]
-
-    return act
 
 
 def write_gif(path: Path, frames: list[NDArray[np.uint8]], seconds: float) -> None:

@@ -20,7 +20,7 @@ from navrep_data.envs.worlds import (
     observation_space,
     own_spec,
 )
-from navrep_data.sim import SimConfig
+from navrep_data.sim import SimConfig, Simulator
 from navrep_data.sim.raster import Camera, draw_frame
 
 _ONE = np.ones(1, np.bool_)
@@ -50,6 +50,8 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ----------
     config : SimConfig
         What is simulated.
+    seen : dict or None
+        The last observation, whatever wrappers make of it.
 
     Raises
     ------
@@ -99,12 +101,17 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._worlds = Worlds(self.config, 1, episode)
         self._pad_humans = pad_humans
         self._running = False
-        self._scan: NDArray[np.float32] | None = None
+        self.seen: Observation | None = None
         self._trail: list[F64] = []
         self._camera: Camera | None = None
         self._window: Window | None = None
         self.observation_space = observation_space(self.config)
         self.action_space = action_space(self.config)
+
+    @property
+    def simulator(self) -> Simulator:
+        """What simulates this one world."""
+        return self._worlds.sim
 
     @property
     def spec(self) -> Any:
@@ -182,7 +189,7 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _observe(self) -> Observation:
         batch = self._worlds.observe()
-        self._scan = batch["scan"][0]
+        self.seen = {name: values[0] for name, values in batch.items()}
         self._trail.append(self._worlds.drawn_robots()[0, :, :2])
         if self.render_mode == "human":
             self._show()
@@ -221,11 +228,11 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         gymnasium.error.ResetNeeded
             If no episode has begun.
         """
-        if self._scan is None:
+        if self.seen is None:
             raise gymnasium.error.ResetNeeded("There is nothing to draw before the first reset().")
         state, grid = self._worlds.sim.state(), self._worlds.sim.grid()
         self._camera = Camera.around(state, grid) if self._camera is None else self._camera.following(state, grid)
-        return draw_frame(state, self._camera, self._scan, self.config.sensor, self._trail, grid, size)
+        return draw_frame(state, self._camera, self.seen["scan"], self.config.sensor, self._trail, grid, size)
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture (480, 480, 3), uint8, in mode ``"rgb_array"``; draw the window in mode ``"human"``."""

@@ -2,14 +2,12 @@
 
 from navrep_data.evaluate.driver import Benchmark, benchmark, redraw
 from navrep_data.evaluate.metrics import METRICS, RATIOS, Contacts, Metric
-from navrep_data.evaluate.policies import BASELINES
 from navrep_data.evaluate.results import Results
 from navrep_data.evaluate.scores import compare, score, summary
 from navrep_data.evaluate.statistics import bootstrap, bootstrap_ratio, mcnemar, wilson
 from navrep_data.evaluate.suites import Scenario, Suite, get_suite, suite_names
 
 __all__ = [
-    "BASELINES",
     "METRICS",
     "RATIOS",
     "Benchmark",

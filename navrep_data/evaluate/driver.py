@@ -14,13 +14,13 @@ from navrep_data._ray import RayCluster
 from navrep_data.errors import ConfigError, DatasetNotFoundError, check_whole
 from navrep_data.evaluate import tables
 from navrep_data.evaluate.executors import Job, run, run_on_ray
-from navrep_data.evaluate.policies import NETWORKS, PilotSpec, resolve_policy
 from navrep_data.evaluate.results import Results, file_name, header_of, open_results
 from navrep_data.evaluate.runner import Episode
 from navrep_data.evaluate.scores import by_variant, compare, summary
 from navrep_data.evaluate.suites import Suite, get_suite
 from navrep_data.generate.executors import EXECUTORS
 from navrep_data.io import atomic_write_bytes, translate_os_error
+from navrep_data.policies import AnyPolicy, PolicySpec, resolve_policy
 
 PHYSICS = ("original", "consistent")
 SAVE_SECONDS = 2.0
@@ -76,7 +76,7 @@ class Benchmark:
 
 
 def benchmark(
-    policies: Sequence[str | Callable[[Any, Any], Any]],
+    policies: Sequence[AnyPolicy],
     suite: str = "navreptest",
     physics: str | None = None,
     episodes: int | None = None,
@@ -101,7 +101,8 @@ def benchmark(
         Baselines (``goal``, ``random``, ``orca``, ``dwa``), names of the zoo, folders of policies (``./folder``,
         ``hf://user/name``), ``module:function``, callables
         ``(scan (64, 1080), robot_state (64, 5)) -> action (64, 2 or 3)`` in [-1, 1], or policies that
-        :func:`navrep_data.zoo.load` returned, fed as by their names. `goal` is always played.
+        :func:`navrep_data.zoo.load` returned, fed as by their names, or any :class:`navrep_data.policies.BasePolicy`.
+        `goal` is always played.
     suite : str
         ``"navreptest"`` or ``"navrep27"``.
     physics : str, optional
@@ -166,7 +167,7 @@ def benchmark(
             for s in (resolve_policy(p, source, inference, bool(chosen.maps), ranges, scaling) for p in policies)
         }.values()
     )
-    specs = [s if s.kind in NETWORKS else _plain(s) for s in specs]
+    specs = [s if s.is_network else _plain(s) for s in specs]
     everybody = specs if any(s.name == "goal" for s in specs) else [resolve_policy("goal"), *specs]
     folder = Path(out) / chosen.folder(kind, first_round)
     try:
@@ -191,9 +192,9 @@ def benchmark(
     return report
 
 
-def _plain(spec: PilotSpec) -> PilotSpec:
+def _plain(spec: PolicySpec) -> PolicySpec:
     """Return a spec without network, for which `inference` means nothing."""
-    return PilotSpec(spec.name, spec.sees, spec.variant, spec.kind, files=spec.files, function=spec.function)
+    return PolicySpec(spec.name, spec.sees, spec.variant, spec.kind, files=spec.files, given=spec.given)
 
 
 def _check(physics: str, workers: int | None, batch: int | None, policies: Sequence[Any]) -> None:
@@ -211,7 +212,7 @@ def _check(physics: str, workers: int | None, batch: int | None, policies: Seque
 def _play(
     suite: Suite,
     physics: str,
-    spec: PilotSpec,
+    spec: PolicySpec,
     results: Results,
     total: int,
     path: Path,
@@ -223,7 +224,7 @@ def _play(
     todo = results.missing(total)  # numbers in the suite
     if not todo:
         return False
-    job = Job(suite.name, physics, spec, tuple(todo), spec.inference == "as_released" and spec.kind in NETWORKS, batch)
+    job = Job(suite.name, physics, spec, tuple(todo), spec.inference == "as_released" and spec.is_network, batch)
     done, saved = total - len(todo), time.monotonic()
     try:
         with closing(play(job)) as played:

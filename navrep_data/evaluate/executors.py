@@ -12,11 +12,11 @@ from typing import Any
 
 from navrep_data._ray import RayCluster
 from navrep_data.errors import NavrepDataError, WorkerDiedError
-from navrep_data.evaluate.policies import PilotSpec
 from navrep_data.evaluate.runner import Episode, n_worlds, play, units
 from navrep_data.evaluate.suite_worlds import SuiteWorlds
 from navrep_data.evaluate.suites import Suite, get_suite
 from navrep_data.io import translate_os_error, without_interrupts
+from navrep_data.policies import Driver, PolicySpec
 
 POLL_SECONDS = 0.2
 # workers hand over what they have finished this often, so that little is lost when they are killed
@@ -35,19 +35,19 @@ class Job:
     ----------
     suite, physics : str
         Names.
-    pilot : PilotSpec
+    policy : PolicySpec
         Who drives.
     episodes : tuple of int
         Numbers of the episodes.
     grouped : bool
-        See :class:`navrep_data.evaluate.pilots.Pilot`.
+        See :class:`navrep_data.policies.BasePolicy`.
     batch : int or None
         Worlds per process; None = a good number.
     """
 
     suite: str
     physics: str
-    pilot: PilotSpec
+    policy: PolicySpec
     episodes: tuple[int, ...]
     grouped: bool = False
     batch: int | None = None
@@ -58,10 +58,10 @@ class Job:
 
 
 def _start(job: Job, suite: Suite, take: Any, count: int) -> Generator[list[Episode]]:
-    with job.pilot.in_its_way():
-        pilot = job.pilot.make(suite.first_seed)
-        worlds = SuiteWorlds(suite.config(job.physics), n_worlds(pilot, job.batch, count))
-        yield from play(suite, worlds, pilot, take)
+    with job.policy.in_its_way():
+        policy = job.policy.make(first_seed=suite.first_seed)
+        worlds = SuiteWorlds(suite.config(job.physics), n_worlds(policy, job.batch, count))
+        yield from play(suite, worlds, Driver(policy), take)
 
 
 def run(job: Job, workers: int) -> Generator[list[Episode]]:

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from navrep_data._version import __version__
 from navrep_data.errors import CorruptDataError, DatasetMismatchError
 from navrep_data.evaluate.metrics import METRICS, Contacts
-from navrep_data.evaluate.policies import PilotSpec
 from navrep_data.evaluate.runner import Episode
 from navrep_data.evaluate.suites import Suite, get_suite
 from navrep_data.io import atomic_write_bytes, read_json
+from navrep_data.policies import PolicySpec
 from navrep_data.schema import RESULTS_FORMAT, RESULTS_VERSION, Event, check_results_version, fed_as, result_name
 
 LETTERS = {Event.GOAL: "S", Event.TIMEOUT: "T"}
@@ -237,7 +237,7 @@ def _lines(value: dict[str, Any]) -> bytes:
     return (text(value, 0) + "\n").encode()
 
 
-def header_of(spec: PilotSpec, suite: Suite, physics: str, first_round: int = 0) -> dict[str, Any]:
+def header_of(spec: PolicySpec, suite: Suite, physics: str, first_round: int = 0) -> dict[str, Any]:
     """Return what results say of who played what with which versions."""
     how = fed_as(spec.settings())
     return {
@@ -287,7 +287,7 @@ def open_results(path: Path, header: dict[str, Any]) -> Results:
     return found
 
 
-def file_name(spec: PilotSpec) -> str:
+def file_name(spec: PolicySpec) -> str:
     """Return the name of a policy's results file."""
     # a folder's name may begin with dots, and files that do are hidden
     plain = "".join(c if c.isalnum() or c in "._-" else "-" for c in spec.name).lstrip(".-") or "policy"

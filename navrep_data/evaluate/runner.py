@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from navrep_data.errors import SimulationError
 from navrep_data.evaluate.metrics import Contacts, measure
-from navrep_data.evaluate.pilots import BLOCK, Pilot
 from navrep_data.evaluate.suite_worlds import SuiteWorlds
 from navrep_data.evaluate.suites import Suite
+from navrep_data.policies import BasePolicy, Driver
+from navrep_data.policies.functions import BLOCK
 from navrep_data.schema import Event
 from navrep_data.sim import Touches
 
@@ -22,7 +23,7 @@ TRAJECTORY_POINTS = 60
 """Most points of a stored trajectory."""
 
 Take = Callable[[], list[int] | None]
-"""Returns the next episodes to play: one, or a whole group for pilots that want groups; None when all are taken."""
+"""Returns the next episodes to play: one, or a whole group for policies that want groups; None when all are taken."""
 
 
 @dataclass(frozen=True)
@@ -130,12 +131,12 @@ def thin(positions: NDArray[np.float64]) -> NDArray[np.int32]:
     return np.rint(100.0 * positions[chosen]).astype(np.int32)
 
 
-def n_worlds(pilot: Pilot, batch: int | None, episodes: int) -> int:
+def n_worlds(policy: BasePolicy, batch: int | None, episodes: int) -> int:
     """Return how many worlds to play in: groups need their rows, networks have a most."""
-    if pilot.grouped:
+    if policy.grouped:
         return BLOCK
     wanted = min(DEFAULT_BATCH if batch is None else batch, max(1, episodes))
-    return wanted if pilot.max_worlds is None else min(wanted, pilot.max_worlds)
+    return wanted if policy.max_rows is None else min(wanted, policy.max_rows)
 
 
 def units(episodes: list[int], grouped: bool) -> list[list[int]]:
@@ -148,7 +149,7 @@ def units(episodes: list[int], grouped: bool) -> list[list[int]]:
     return list(groups.values())
 
 
-def play(suite: Suite, worlds: SuiteWorlds, pilot: Pilot, take: Take) -> Iterator[list[Episode]]:
+def play(suite: Suite, worlds: SuiteWorlds, driver: Driver, take: Take) -> Iterator[list[Episode]]:
     """Play episodes until there are none left, and yield those that a step has finished.
 
     Parameters
@@ -157,7 +158,7 @@ def play(suite: Suite, worlds: SuiteWorlds, pilot: Pilot, take: Take) -> Iterato
         Whose numbers are played.
     worlds : Worlds
         To play in.
-    pilot : Pilot
+    driver : Driver
         Who drives.
     take : callable
         Where episodes come from.
@@ -167,19 +168,17 @@ def play(suite: Suite, worlds: SuiteWorlds, pilot: Pilot, take: Take) -> Iterato
     list of Episode
         In the order in which they end; empty lists in between.
     """
+    driver.start(worlds.simulator)
     recorder = _Recorder(worlds, suite.max_steps)
     playing = np.full(worlds.n, -1, np.int64)
     more = True
     while True:
         if more:
-            more = _refill(suite, worlds, pilot, recorder, playing, take)
+            more = _refill(suite, worlds, driver, recorder, playing, take)
         active = playing >= 0
         if not active.any():
             return
-        actions = np.clip(pilot.act(worlds), -1.0, 1.0)
-        actions[~active] = 0.0
-        events = worlds.step(actions)
-        pilot.observe(worlds.commands(actions))
+        events = worlds.step(driver.commands(worlds.simulator, active))
         recorder.advance(active)
         ended = np.flatnonzero(active & (events != 0))
         yield [recorder.finish(int(w), int(playing[w]), Event(int(events[w]))) for w in ended]
@@ -187,11 +186,11 @@ def play(suite: Suite, worlds: SuiteWorlds, pilot: Pilot, take: Take) -> Iterato
 
 
 def _refill(
-    suite: Suite, worlds: SuiteWorlds, pilot: Pilot, recorder: _Recorder, playing: NDArray[Any], take: Take
+    suite: Suite, worlds: SuiteWorlds, driver: Driver, recorder: _Recorder, playing: NDArray[Any], take: Take
 ) -> bool:
     """Start the next episodes in free worlds; returns False once there are none left."""
-    free = np.flatnonzero(playing < 0)
-    if len(free) == 0 or (pilot.grouped and len(free) < worlds.n):
+    free, grouped = np.flatnonzero(playing < 0), driver.policy.grouped
+    if len(free) == 0 or (grouped and len(free) < worlds.n):
         return True
     mask = np.zeros(worlds.n, np.bool_)
     more = True
@@ -201,15 +200,16 @@ def _refill(
             more = False
             break
         # an episode of a group has a row of its own
-        rows = [k % BLOCK for k in unit] if pilot.grouped else [int(w)]
+        rows = [k % BLOCK for k in unit] if grouped else [int(w)]
         playing[rows] = unit
         mask[rows] = True
-        if pilot.grouped:
+        if grouped:
+            driver.start(worlds.simulator)
             break
     if mask.any():
         seeds = np.where(mask, suite.first_seed + playing, 0)
         scenarios = np.where(mask, playing % len(suite.scenarios), 0)
         worlds.reset(mask, seeds, scenarios)
         recorder.begin(mask)
-        pilot.start(worlds, mask, playing)
+        driver.reset(mask, playing)
     return more

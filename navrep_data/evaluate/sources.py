@@ -7,16 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data.errors import CorruptDataError, DatasetMismatchError
-from navrep_data.evaluate.policies import BASELINES
 from navrep_data.evaluate.results import Results
 from navrep_data.evaluate.scores import SUCCESSES, score, summary
 from navrep_data.evaluate.suites import get_suite, suite_names
 from navrep_data.evaluate.world_model import WorldModelError
 from navrep_data.evaluate.world_model_results import FOLDER
 from navrep_data.evaluate.world_model_results import load as load_world_model
+from navrep_data.io import is_path
+from navrep_data.policies import BASELINES
 from navrep_data.zoo import measured, registry
 from navrep_data.zoo.folders import place_of
-from navrep_data.zoo.names import OWN, is_path
+from navrep_data.zoo.names import OWN
 from navrep_data.zoo.registry import Record
 
 SOURCES = {

@@ -15,13 +15,14 @@ from navrep_data.generate.executors import EXECUTORS, LocalExecutor, RayExecutor
 from navrep_data.generate.inputs import named_from
 from navrep_data.generate.parts import Part, parse_part
 from navrep_data.generate.plan import Request, check_folder, check_same, check_settings, make_request
-from navrep_data.generate.policy import load_callable, make_policy
+from navrep_data.generate.policy import make_policy
 from navrep_data.generate.run import Run, Say, silent
 from navrep_data.generate.storage import check_url
 from navrep_data.generate.worker import DatasetSpec
 from navrep_data.io import translate_os_error
+from navrep_data.policies import AnyPolicy
 from navrep_data.shards import MANIFEST_FILE, Manifest, writer_lock
-from navrep_data.sim import PolicyFunction, check_seed, make_config
+from navrep_data.sim import check_seed, make_config
 
 MAX_WORKERS = 256
 
@@ -79,7 +80,7 @@ def generate(
     obstacles: int | None = None,
     legs: bool = True,
     maps: Sequence[str] | None = None,
-    policy: str | PolicyFunction = "orca",
+    policy: AnyPolicy = "orca",
     policy_batch: int = 64,
     shard_size: int | None = None,
     scan_dtype: str | None = None,
@@ -120,11 +121,13 @@ def generate(
         Largest number of squares, and of walls.
     legs : bool
         Whether the lidar sees legs; otherwise trunks.
-    policy : str or callable
-        ``"orca"``, another scripted name, ``"module:function"``, or a callable
-        ``policy(scan (B, rays) [m], robot_state (B, 5)) -> action (B, 3) or (B, 2)`` [m/s, m/s, rad/s].
+    policy : str, callable or BasePolicy
+        ``"orca"``, another scripted name, or what :func:`navrep_data.policies.resolve_policy` takes: ``"dwa"``, a name
+        of the zoo, ``"./folder"``, ``"module:function"``, a callable
+        ``policy(scan (B, n_rays) [m], robot_state (B, 5)) -> action (B, 3) or (B, 2)`` in [-1, 1], shares of the
+        robot's largest velocities.
     policy_batch : int
-        Batch size that a Python policy always sees.
+        Batch size that functions and networks always see.
     shard_size : int, optional
         Sequences per shard; about 20,000 rows by default.
     scan_dtype : {"uint16", "float32"}, optional
@@ -178,8 +181,8 @@ def generate(
     if workers is not None:
         workers = check_whole("--workers", workers, 1, MAX_WORKERS)
     chosen = make_policy(policy, policy_batch)
-    if not chosen.scripted and chosen.function is None:
-        load_callable(chosen.name)  # fail here, not in a worker
+    if chosen.spec is not None:
+        chosen.spec.make(chosen.batch)  # fail here, not in a worker
     root = Path(out) if out is not None else Path("data") / env
     if executor != "local":
         root = root.absolute()  # workers elsewhere have other working folders
@@ -276,7 +279,7 @@ def _command(
     words += [word for name in maps or () for word in ("--map", name)]
     if spec.policy.name != "orca":
         words += ["--policy", spec.policy.name]
-    if not spec.policy.scripted and spec.policy.batch != 64:
+    if spec.policy.spec is not None and spec.policy.batch != 64:
         words += ["--policy-batch", str(spec.policy.batch)]
     for flag, value in (("--shard-size", shard_size), ("--scan-dtype", scan_dtype)):
         if value is not None:

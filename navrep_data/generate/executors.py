@@ -145,7 +145,7 @@ class LocalExecutor:
                     yield task, entry
                 yield None
         except (PicklingError, AttributeError, TypeError) as error:
-            if self.spec.policy.function is None:
+            if self.spec.policy.spec is None or self.spec.policy.spec.given is None:
                 raise
             raise PolicyError(
                 f"The policy cannot be sent to worker processes ({error}). Expected a function or object of an "

@@ -6,15 +6,12 @@ extending, parts of a job array, workers elsewhere, making it again to prove it.
 
 from __future__ import annotations
 
-import hashlib
-import inspect
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from navrep_data.errors import DatasetMismatchError, MapError
-from navrep_data.generate.policy import PolicySpec, load_callable
+from navrep_data.generate.policy import DatasetPolicy
 from navrep_data.shards import Manifest
 from navrep_data.sim import GridMap, SimConfig
 from navrep_data.sim.map_tables import map_for_physics
@@ -27,22 +24,7 @@ MAP, POLICY = "map:", "policy"
 _SHOWN = 12
 
 
-def source_hash(function: Callable[..., Any]) -> str:
-    """Return the SHA-256 of what a policy is: its own ``content_hash()``, else the file that it comes from.
-
-    Empty where there is neither, as for functions typed into an interpreter. What that file imports is not in it.
-    """
-    own = getattr(function, "content_hash", None)
-    if callable(own):
-        return str(own())
-    try:
-        file = inspect.getsourcefile(function if inspect.isroutine(function) else type(function))
-        return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
-    except (TypeError, OSError):
-        return ""
-
-
-def inputs_of(config: SimConfig, policy: PolicySpec) -> dict[str, str]:
+def inputs_of(config: SimConfig, policy: DatasetPolicy) -> dict[str, str]:
     """Return SHA-256 hashes of what a dataset is made from, as it is now: ``map:NAME`` and ``policy``.
 
     Raises
@@ -53,10 +35,8 @@ def inputs_of(config: SimConfig, policy: PolicySpec) -> dict[str, str]:
         If the policy cannot be imported.
     """
     found = {MAP + name: _grid(file, config).hash for name, file in _maps(config)}
-    if not policy.scripted:
-        digest = source_hash(policy.function if policy.function is not None else load_callable(policy.name))
-        found |= {POLICY: digest} if digest else {}
-    return found
+    digest = policy.content()
+    return found | ({POLICY: digest} if digest else {})
 
 
 def origins_of(config: SimConfig) -> dict[str, tuple[float, float]]:
@@ -161,7 +141,7 @@ def check_policy(root: Path, old: Manifest, now: Mapping[str, str]) -> None:
         )
 
 
-def check_here(spec_inputs: Mapping[str, str], config: SimConfig, policy: PolicySpec, where: str) -> None:
+def check_here(spec_inputs: Mapping[str, str], config: SimConfig, policy: DatasetPolicy, where: str) -> None:
     """Make sure that a worker has before it what the run began with.
 
     Raises
@@ -169,7 +149,7 @@ def check_here(spec_inputs: Mapping[str, str], config: SimConfig, policy: Policy
     DatasetMismatchError
         Naming what differs, and `where`.
     """
-    for key, digest in inputs_of(config, policy).items():
+    for key, digest in inputs_of(config, policy.found_here()).items():
         if digest != spec_inputs.get(key):
             what = f"map {key.removeprefix(MAP)!r}" if key.startswith(MAP) else f"policy {policy.name}"
             raise DatasetMismatchError(

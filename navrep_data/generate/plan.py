@@ -22,7 +22,7 @@ from navrep_data.errors import (
 )
 from navrep_data.generate.inputs import check_unchanged, inputs_of, origins_of
 from navrep_data.generate.parts import PARTS, Part
-from navrep_data.generate.policy import PolicySpec
+from navrep_data.generate.policy import DatasetPolicy
 from navrep_data.generate.storage import STAGING
 from navrep_data.generate.worker import DatasetSpec, ShardTask, all_shards
 from navrep_data.io import PART_SUFFIX
@@ -121,7 +121,7 @@ def check_settings(
 
 
 def make_request(
-    root: Path, config: SimConfig, settings: RolloutSettings, policy: PolicySpec, seed: int, n: int,
+    root: Path, config: SimConfig, settings: RolloutSettings, policy: DatasetPolicy, seed: int, n: int,
     shard_size: int | None, storage: str | None = None, part: Part | None = None,
 ) -> Request:  # fmt: skip
     """Return the checked request; chooses the shard size where none is given."""

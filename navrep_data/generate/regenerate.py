@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from navrep_data.errors import ConfigError, DatasetError, check_whole
 from navrep_data.generate.inputs import check_policy, find_maps, inputs_of
-from navrep_data.generate.policy import PolicySpec, make_rollout
+from navrep_data.generate.policy import make_policy, make_rollout
 from navrep_data.generate.worker import DatasetSpec, new_writer
 from navrep_data.schema import SCAN_SCALE
 from navrep_data.shards import DatasetFolder, Manifest, ShardEntry, sequence_hash
@@ -95,8 +95,8 @@ def recipe_of(root: Path, manifest: Manifest, maps: Sequence[str] = ()) -> Datas
         *(name in manifest.columns for name in ("rings", "humans", "scan_label", "contact")),
     )  # fmt: skip
     name = str(manifest.policy["name"])
-    policy = PolicySpec(name, int(manifest.policy.get("batch", 1)))
-    if policy.scripted and policy.to_dict() != manifest.policy:
+    policy = make_policy(name, int(manifest.policy.get("batch", 1)))
+    if policy.spec is None and policy.to_dict() != manifest.policy:
         raise ConfigError(
             f"{root} was made with policy settings {manifest.policy}, this version has "
             f"{ScriptedPolicy(name).to_dict()}; use the version in its manifest."
@@ -151,7 +151,8 @@ def regenerate(root: Path | str, k: int, seed: int | None = None, maps: Sequence
             shard, at = place
             first = at // rollout.batch * rollout.batch
             group = manifest.shards[shard].numbers[first : first + rollout.batch]
-            columns, worlds = rollout.run(group)[at - first]
+            with spec.policy.in_its_way():
+                columns, worlds = rollout.run(group)[at - first]
             comparisons.append(_compare(folder, spec, place, columns, worlds))
     return RegenerateReport(comparisons)
 

@@ -177,7 +177,7 @@ class Run:
     def _prepare(self, executor: LocalExecutor | RayExecutor) -> float | None:
         """Compile what workers like this process need; return how long a row will take [s] where somebody is told."""
         spec = self.request.spec
-        if not spec.policy.scripted or not executor.like_here:
+        if spec.policy.spec is not None or not executor.like_here:
             return None
         if not spec.config.maps:
             compile_ahead(spec)

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data.generate.inputs import check_here
-from navrep_data.generate.policy import PolicySpec, make_rollout
+from navrep_data.generate.policy import DatasetPolicy, make_rollout
 from navrep_data.generate.storage import Store, store_of
 from navrep_data.shards import SPLITS, Ranges, ShardEntry, ShardWriter, count_in_split, nth_of_split, ranges_of
 from navrep_data.shards.entries import shard_file
-from navrep_data.sim import CallableRollout, RolloutSettings, ScriptedRollout, SimConfig
+from navrep_data.sim import DrivenRollout, RolloutSettings, ScriptedRollout, SimConfig
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class DatasetSpec:
     root: Path
     config: SimConfig
     settings: RolloutSettings
-    policy: PolicySpec
+    policy: DatasetPolicy
     seed: int
     columns: tuple[str, ...]
     storage: str | None = None
@@ -136,7 +136,7 @@ def run_task(task: ShardTask) -> ShardEntry:
     return make_shard(_state["spec"], task, _state["rollout"], report)
 
 
-def rollout_of(spec: DatasetSpec) -> ScriptedRollout | CallableRollout:
+def rollout_of(spec: DatasetSpec) -> ScriptedRollout | DrivenRollout:
     """Return what simulates this dataset's sequences."""
     return make_rollout(spec.config, spec.settings, spec.policy, spec.seed)
 
@@ -144,7 +144,7 @@ def rollout_of(spec: DatasetSpec) -> ScriptedRollout | CallableRollout:
 def make_shard(
     spec: DatasetSpec,
     task: ShardTask,
-    rollout: ScriptedRollout | CallableRollout,
+    rollout: ScriptedRollout | DrivenRollout,
     report: Callable[[int], None],
 ) -> ShardEntry:
     """Simulate, compress, hash and publish one shard.
@@ -155,7 +155,7 @@ def make_shard(
         The dataset.
     task : ShardTask
         Which of its shards.
-    rollout : ScriptedRollout or CallableRollout
+    rollout : ScriptedRollout or DrivenRollout
         From :func:`rollout_of`; reused between shards.
     report : callable
         Called with the number of rows after each sequence.
@@ -171,11 +171,12 @@ def make_shard(
         If there is no room; what is in place stays as it was.
     """
     writer, numbers = new_writer(spec, task.split), task.numbers
-    for start in range(0, len(numbers), rollout.batch):
-        group = numbers[start : start + rollout.batch]
-        for number, (columns, worlds) in zip(group, rollout.run(group), strict=True):
-            writer.append(number, columns, worlds)
-            report(spec.settings.length)
+    with spec.policy.in_its_way():
+        for start in range(0, len(numbers), rollout.batch):
+            group = numbers[start : start + rollout.batch]
+            for number, (columns, worlds) in zip(group, rollout.run(group), strict=True):
+                writer.append(number, columns, worlds)
+                report(spec.settings.length)
     return spec.store.publish(task.index, writer.finish(), staged=task.staged)
 
 

@@ -18,8 +18,10 @@ from navrep_data.io._files import (
 from navrep_data.io.download import FileId, download, git_blob_sha1, is_offline, switched_off
 from navrep_data.io.folders import new_folder
 from navrep_data.io.interrupts import without_interrupts
+from navrep_data.io.places import HUB_SCHEME, here_hint, is_path
 
 __all__ = [
+    "HUB_SCHEME",
     "PART_SUFFIX",
     "FileId",
     "atomic_write_bytes",
@@ -28,7 +30,9 @@ __all__ = [
     "download",
     "fsync_dir",
     "git_blob_sha1",
+    "here_hint",
     "is_offline",
+    "is_path",
     "json_bytes",
     "new_folder",
     "raise_refusal",

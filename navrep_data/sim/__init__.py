@@ -2,9 +2,8 @@
 
 from navrep_data.sim.actions import robot_contract, scale_actions, velocity_commands
 from navrep_data.sim.config import SimConfig
-from navrep_data.sim.driving import RobotPolicy, knows_robots
 from navrep_data.sim.gridmap import GridMap
-from navrep_data.sim.map_rollout import CallableMapRollout, ScriptedMapRollout
+from navrep_data.sim.map_rollout import DrivenMapRollout, ScriptedMapRollout
 from navrep_data.sim.maps import load_map, map_names
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
 from navrep_data.sim.registry import (
@@ -16,8 +15,8 @@ from navrep_data.sim.registry import (
     numpy_seed,
 )
 from navrep_data.sim.rollout import (
-    CallableRollout,
-    PolicyFunction,
+    DrivenRollout,
+    RobotDriver,
     RolloutSettings,
     ScriptedRollout,
     SequenceRows,
@@ -28,11 +27,10 @@ from navrep_data.sim.simulator import Simulator, Touches, WorldState, check_seed
 __all__ = [
     "MAP_GROUPS",
     "SCRIPTED",
-    "CallableMapRollout",
-    "CallableRollout",
+    "DrivenMapRollout",
+    "DrivenRollout",
     "GridMap",
-    "PolicyFunction",
-    "RobotPolicy",
+    "RobotDriver",
     "RolloutSettings",
     "Scenario",
     "ScriptedMapRollout",
@@ -49,7 +47,6 @@ __all__ = [
     "environment_names",
     "get_scenario",
     "gymnasium_id",
-    "knows_robots",
     "load_map",
     "make_config",
     "map_names",

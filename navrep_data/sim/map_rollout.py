@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from navrep_data.schema import ACTION_SIZE
 from navrep_data.sim import _ian_rollout
@@ -16,9 +14,8 @@ from navrep_data.sim.config import SimConfig
 from navrep_data.sim.map_worlds import MapWorlds
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
 from navrep_data.sim.rollout import (
-    _STATE,
-    CallableRollout,
-    PolicyFunction,
+    DrivenRollout,
+    RobotDriver,
     RolloutSettings,
     ScriptedRollout,
     SequenceRows,
@@ -26,9 +23,9 @@ from navrep_data.sim.rollout import (
     _Outputs,
     _worlds,
 )
-from navrep_data.sim.simulator import check_seed
+from navrep_data.sim.simulator import Simulator, check_seed
 
-__all__ = ["CallableMapRollout", "ScriptedMapRollout"]
+__all__ = ["DrivenMapRollout", "ScriptedMapRollout"]
 
 NAME_BYTES = 64
 """Room for names of maps and scenarios in worlds files."""
@@ -37,8 +34,8 @@ NAME_BYTES = 64
 class _MapSequences:
     """Worlds on maps and room for the rows of a group of sequences."""
 
-    def __init__(self, config: SimConfig, settings: RolloutSettings, n: int) -> None:
-        self.maps = MapWorlds(config, n)
+    def __init__(self, config: SimConfig, settings: RolloutSettings, n: int, maps: MapWorlds | None = None) -> None:
+        self.maps = MapWorlds(config, n) if maps is None else maps
         self.settings = settings
         self.out = _Outputs(config, settings, n)
         self.places = np.zeros((n, settings.length, 2), np.int64)
@@ -135,32 +132,25 @@ class ScriptedMapRollout(ScriptedRollout):
         return s.rows(sequences)
 
 
-class CallableMapRollout(CallableRollout):
-    """Roll out sequences on maps under a Python policy; see :class:`navrep_data.sim.CallableRollout`."""
+class DrivenMapRollout(DrivenRollout):
+    """Roll out sequences on maps under a policy; see :class:`navrep_data.sim.DrivenRollout`."""
 
     def __init__(
-        self, config: SimConfig, settings: RolloutSettings, policy: PolicyFunction, seed: int, batch: int = 64
+        self, config: SimConfig, settings: RolloutSettings, driver: RobotDriver, seed: int, batch: int = 64
     ) -> None:
-        super().__init__(config, settings, policy, seed, batch)
+        super().__init__(config, settings, driver, seed, batch)
         self._sequences: _MapSequences | None = None
 
     def run(self, sequences: Sequence[int]) -> list[SequenceRows]:
-        """Return the rows of consecutive sequences, in order; the arrays are overwritten by the next call."""
+        """Return the rows of these sequences, in order; the arrays are overwritten by the next call."""
         n = len(sequences)
-        if self._sequences is None or self._sequences.maps.n_worlds != n:
-            self._sequences = _MapSequences(self.config, self.settings, n)
-        s = self._sequences
+        if self.simulator is None or self.simulator.n_worlds != n or self._sequences is None:
+            self.simulator = Simulator.without_worlds(self.config, n)
+            self._sequences = _MapSequences(self.config, self.settings, n, self.simulator.maps)
+        simulator, s = self.simulator, self._sequences
         s.begin(self.seed, sequences)
-        reset: Any = getattr(self.policy, "reset", None)
-        if reset is not None:
-            reset(batch_size=self.batch)
         for row in range(self.settings.length):
             s.observe(row)
-            first: NDArray[np.bool_] = s.out.ints[:, row, 2] == 0
-            if reset is not None and row > 0 and first.any():
-                reset(mask=self._fill_up(first))
-            s.actions[:] = 0.0
-            if row < self.settings.length - 1:
-                s.actions[:, 0] = self._act(s.maps.arrays.scans, s.out.floats[:, row, _STATE])
+            s.actions[:, 0] = self._drive(simulator, row, sequences, s.out, s.maps.arrays.scans)
             s.act(row)
         return s.rows(sequences)

@@ -157,7 +157,7 @@ class MapWorlds:
 
     def no_place(self, world: int) -> SimulationError:
         """Return the error for a world whose map has no room for a start and a goal."""
-        grid = self.data.maps[self.map_index(world)]
+        grid = self.data.maps[self.map_indices()[world]]
         return SimulationError(
             f"No start and goal for {self.config.robots} robots on map '{grid.name}': expected free places more "
             "than 3 m apart; take fewer robots or a larger map."
@@ -213,15 +213,17 @@ class MapWorlds:
 
     def polygons(self, world: int) -> list[F64]:
         """Return the outlines of the world's map, simplified within 5 cm, for drawing."""
-        return self.data.maps[self.map_index(world)].contours(0.05)
+        grid = self.data.maps[int(self.map_indices()[world])]
+        return grid.contours(0.05)
 
     def origins(self) -> F64:
         """Return where the worlds' (0, 0) is in the frames of their map files, (W, 2) [m]."""
-        return self.data.origins[self.arrays.worlds.place[:, il.M_MAP].astype(np.int64)]
+        return self.data.origins[self.map_indices()]
 
-    def map_index(self, world: int) -> int:
-        """Return which of the config's maps a world is on."""
-        return int(self.arrays.worlds.place[world, il.M_MAP])
+    def map_indices(self) -> NDArray[np.int64]:
+        """Return which of the config's maps each world is on, (W,)."""
+        indices: NDArray[np.int64] = self.arrays.worlds.place[:, il.M_MAP].astype(np.int64)
+        return indices
 
     def scenarios_played(self) -> NDArray[np.int64]:
         """Return the index of the scenario that each world plays, (W,); -1 where start and goal are random."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from navrep_data.errors import ConfigError, PolicyError, SimulationError
+from navrep_data.errors import ConfigError, SimulationError
 from navrep_data.observations import scan_to_rings
 from navrep_data.schema import ACTION_SIZE, HUMAN_FIELDS, RINGS_SHAPE, Event
 from navrep_data.sim import _layout as lay
@@ -17,12 +18,50 @@ from navrep_data.sim._batch import reset_worlds, seed_worlds
 from navrep_data.sim._rollout import begin_row, begin_rows, choose_actions, finish_row, finish_rows, rollout_sequence
 from navrep_data.sim._step import reset_world
 from navrep_data.sim.config import SimConfig
-from navrep_data.sim.driving import RobotPolicy, knows_robots
 from navrep_data.sim.policies import SCRIPTED, ScriptedPolicy
-from navrep_data.sim.simulator import WorldArrays, check_seed, no_world
+from navrep_data.sim.simulator import Simulator, WorldArrays, check_seed, no_world
 
-PolicyFunction = Callable[[NDArray[np.float32], NDArray[np.float32]], Any]
-"""``policy(scan (B, rays) [m], robot_state (B, 5)) -> action (B, 2) or (B, 3)``, body velocities."""
+
+class RobotDriver(Protocol):
+    """What drives the robots of sequences: :class:`navrep_data.policies.Driver`, said here without importing it."""
+
+    def start(self, simulator: Simulator) -> None:
+        """Begin a group of sequences."""
+
+    def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64]) -> None:
+        """Begin episodes in the worlds of `mask`, with these seeds."""
+
+    def commands(
+        self,
+        simulator: Simulator,
+        mask: NDArray[np.bool_] | None = None,
+        seen: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
+    ) -> NDArray[np.float64]:
+        """Return what robots are sent, (W, 3) [m/s, m/s, rad/s]."""
+
+
+def episode_seeds(
+    seed: int, sequences: Sequence[int], episodes: NDArray[np.int32], mask: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """Return seeds (W,) for what drives, one for each episode that begins; they depend on nothing else.
+
+    Parameters
+    ----------
+    seed : int
+        The dataset's.
+    sequences : sequence of int
+        Numbers of W sequences.
+    episodes : ndarray of shape (W,)
+        Numbers of their present episodes.
+    mask : ndarray of shape (W,), bool
+        Where they begin; the seeds of others are 0.
+    """
+    seeds = np.zeros(len(mask), np.int64)
+    for w in np.flatnonzero(mask):
+        words = hashlib.blake2b(f"{seed} {sequences[w]} {episodes[w]}".encode(), digest_size=8)
+        seeds[w] = int.from_bytes(words.digest(), "little") >> 1
+    return seeds
+
 
 # columns of the packed float output of the kernels
 _STATE, _ACTION, _REWARD, _POSE, _RADIUS = slice(0, 5), slice(5, 8), 8, slice(9, 12), 12
@@ -217,48 +256,63 @@ class ScriptedRollout:
         return [(_columns(out, 0, sequence, self.settings), _worlds(out, 0, sequence))]
 
 
-class CallableRollout:
-    """Roll out sequences under a Python policy, a fixed group of them at a time.
+class DrivenRollout:
+    """Roll out sequences under a policy that is asked at every row, a fixed group of them at a time.
 
     Parameters
     ----------
     config, settings, seed
         As for :class:`ScriptedRollout`.
-    policy : callable
-        ``policy(scan, robot_state) -> action``: (B, 1080) [m] and (B, 5) in, (B, 2) or (B, 3) [m/s, m/s, rad/s] out. If
-        it has a method ``reset``, that is called as ``reset(batch_size=B)`` at the start of a group and
-        ``reset(mask=...)`` where new episodes begin. A policy of the zoo drives as it is, see
-        :class:`navrep_data.sim.RobotPolicy`.
+    driver : RobotDriver
+        Who drives. It is started anew for each group, so that rows do not depend on what was made before.
     batch : int
-        Sequences per group. The policy always sees exactly this many rows (the last group is filled up with copies of
-        its first world), so that a network's numbers never depend on how many sequences there are.
+        Sequences per group.
     """
 
     def __init__(
-        self, config: SimConfig, settings: RolloutSettings, policy: PolicyFunction, seed: int, batch: int = 64
+        self, config: SimConfig, settings: RolloutSettings, driver: RobotDriver, seed: int, batch: int = 64
     ) -> None:
         if config.robots > 1:
             raise ConfigError(
-                f"robots={config.robots} with a Python policy: it drives one robot; set robots=1, or take a scripted "
-                f"policy, which drives all ({', '.join(SCRIPTED)})."
+                f"robots={config.robots} with a policy that drives one robot; set robots=1, or take a scripted policy, "
+                f"which drives all ({', '.join(SCRIPTED)})."
             )
         self.config = config
         self.settings = settings
-        self.policy = RobotPolicy(policy, config) if knows_robots(policy) else policy
+        self.driver = driver
         self.seed = check_seed(seed)
         self.batch = batch
-        self._arrays: WorldArrays | None = None
+        self.simulator: Simulator | None = None
         self._out: _Outputs | None = None
+
+    def _begin(self, n: int) -> Simulator:
+        """Return the worlds of a group, made anew where it has another size than the last one."""
+        if self.simulator is None or self.simulator.n_worlds != n:
+            self.simulator = Simulator.without_worlds(self.config, n)
+            self._out = _Outputs(self.config, self.settings, n)
+            _prepare(self.simulator.arrays, self.settings)
+        return self.simulator
+
+    def _drive(
+        self, simulator: Simulator, row: int, sequences: Sequence[int], out: _Outputs, scans: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
+        """Tell the driver of new episodes, and return what robots are sent, (W, 3); nothing after the last row."""
+        first = out.ints[:, row, 2] == 0
+        if row == 0:
+            self.driver.start(simulator)
+        if first.any():
+            self.driver.reset(first, episode_seeds(self.seed, sequences, out.ints[:, row, 1], first))
+        if row == self.settings.length - 1:
+            return np.zeros((len(sequences), ACTION_SIZE))
+        return self.driver.commands(simulator, seen=(scans, np.ascontiguousarray(out.floats[:, row, _STATE])))
 
     def run(self, sequences: Sequence[int]) -> list[SequenceRows]:
         """Return the rows of these sequences, in order; the arrays are overwritten by the next call."""
         n = len(sequences)
-        if self._arrays is None or self._out is None or self._arrays.agents.shape[0] != n:
-            self._arrays = WorldArrays(self.config, n)
-            self._out = _Outputs(self.config, self.settings, n)
-            _prepare(self._arrays, self.settings)
-        a, out = self._arrays, self._out
-        seed_worlds(a.rng, a.scalars, self.seed, np.array(sequences))
+        simulator = self._begin(n)
+        a, out = simulator.arrays, self._out
+        assert out is not None
+        simulator.seed_worlds(self.seed, np.array(sequences))
         out.counts[:] = 0
         everything = np.ones(n, np.bool_)
         if not reset_worlds(
@@ -270,21 +324,13 @@ class CallableRollout:
         gave_up = np.zeros(n, np.bool_)
         result = np.zeros(2)  # reward and event of one robot
         length = self.settings.length
-        reset = getattr(self.policy, "reset", None)
-        if reset is not None:
-            reset(batch_size=self.batch)
         for row in range(length):
             begin_rows(
                 row, a.agents, a.scalars, a.vertices, a.polygon_start, a.edges, a.circles, a.dirs, a.inv_work,
                 a.owner_work, a.hits, a.scans, a.params, a.flags, out.scan, out.floats, out.ints, out.humans,
                 out.labels, out.episodes, out.corners, out.sizes, out.table, out.counts,
             )  # fmt: skip
-            first = out.ints[:, row, 2] == 0
-            if reset is not None and row > 0 and first.any():
-                reset(mask=self._fill_up(first))
-            actions = np.zeros((n, ACTION_SIZE))
-            if row < length - 1:
-                actions[:] = self._act(a.scans, out.floats[:, row, _STATE])
+            actions = self._drive(simulator, row, sequences, out, a.scans)
             if not finish_rows(
                 row, length, pending, gave_up, actions, a.agents, a.agents32, a.scalars, a.vertices, a.polygon_start,
                 a.edges, a.obst_f, a.obst_i, a.boxes, a.rng, a.params, a.flags, a.orca_params, a.work_f, a.work_i,
@@ -292,25 +338,6 @@ class CallableRollout:
             ):  # fmt: skip
                 raise _no_world(a.config, sequences[0])
         return [(_columns(out, w, s, self.settings), _worlds(out, w, s)) for w, s in enumerate(sequences)]
-
-    def _act(self, scans: NDArray[np.float32], states: NDArray[np.float32]) -> NDArray[np.float64]:
-        actions = np.asarray(self.policy(self._fill_up(scans), self._fill_up(states)), np.float64)
-        n = self.batch
-        if actions.shape == (n, 2):
-            actions = np.concatenate([actions, np.zeros((n, 1))], axis=1)
-        if actions.shape != (n, ACTION_SIZE):
-            raise PolicyError(
-                f"The policy returned shape {actions.shape}, expected ({n}, 3) or ({n}, 2): "
-                "vx, vy [m/s], omega [rad/s]."
-            )
-        if not np.isfinite(actions).all():
-            raise PolicyError("The policy returned NaN or infinity, expected finite velocities [m/s, m/s, rad/s].")
-        return actions[: scans.shape[0]]
-
-    def _fill_up(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """Return a copy of `rows` with exactly `batch` rows."""
-        missing = self.batch - rows.shape[0]
-        return np.concatenate([rows, np.repeat(rows[:1], missing, axis=0)])
 
 
 def check_rings(config: SimConfig, rings: bool) -> None:

@@ -215,14 +215,26 @@ class Simulator:
     """
 
     def __init__(self, config: SimConfig, n_worlds: int = 1, seed: int = 0, first_sequence: int = 0) -> None:
-        n_worlds = check_whole("n_worlds", n_worlds, 1)
+        self._allocate(config, n_worlds)
+        self.seed_worlds(seed, check_seed(first_sequence) + np.arange(n_worlds))
+        self.reset()
+
+    @classmethod
+    def without_worlds(cls, config: SimConfig, n_worlds: int) -> Simulator:
+        """Return a batch of worlds that have not begun: call :meth:`seed_worlds` and :meth:`reset` first."""
+        self = cls.__new__(cls)
+        self._allocate(config, n_worlds)
+        return self
+
+    def _allocate(self, config: SimConfig, n_worlds: int) -> None:
         self.config = config
-        self.n_worlds = n_worlds
+        self.n_worlds = n_worlds = check_whole("n_worlds", n_worlds, 1)
         self.maps = MapWorlds(config, n_worlds) if config.world == "map" else None
         self.arrays: Any = WorldArrays(config, n_worlds) if self.maps is None else self.maps.arrays
-        sequences = check_seed(first_sequence) + np.arange(n_worlds)
+
+    def seed_worlds(self, seed: int, sequences: NDArray[np.int64]) -> None:
+        """Have world w draw from the stream of (seed, sequences[w]) from its next reset on."""
         _batch.seed_worlds(self.arrays.rng, self.arrays.scalars, check_seed(seed), sequences)
-        self.reset()
 
     def reset(self, mask: ArrayLike | None = None) -> None:
         """Start the next episode, in all worlds or in those where `mask` (W,) is True."""
@@ -570,9 +582,18 @@ class Simulator:
         """Return which of the config's scenarios each world plays, (W,) indices; -1 where none."""
         return np.full(self.n_worlds, -1, np.int64) if self.maps is None else self.maps.scenarios_played()
 
+    def grids(self) -> tuple[GridMap, ...]:
+        """Return the maps that worlds may be on; none where there are no maps."""
+        return () if self.maps is None else tuple(self.maps.data.maps)
+
+    def map_indices(self) -> NDArray[np.int64]:
+        """Return which of :meth:`grids` each world is on, (W,); -1 where there are no maps."""
+        return np.full(self.n_worlds, -1, np.int64) if self.maps is None else self.maps.map_indices()
+
     def grid(self, world: int = 0) -> GridMap | None:
         """Return the map that a world is on, None where there is none."""
-        return None if self.maps is None else self.maps.data.maps[self.maps.map_index(world)]
+        grids = self.grids()
+        return grids[self.map_indices()[world]] if grids else None
 
     def robot_events(self) -> NDArray[np.uint8]:
         """Return what the last step led to for each robot, (W, R) uint8 event codes."""

@@ -11,13 +11,13 @@ import os
 from pathlib import Path
 from typing import Any
 
+from navrep_data.io import HUB_SCHEME, is_path
 from navrep_data.sb3_file import ORIGIN
 from navrep_data.zoo import fetching as _fetching
 from navrep_data.zoo import folders as _folders
 from navrep_data.zoo import registry as _registry
 from navrep_data.zoo.fetching import fetch
 from navrep_data.zoo.folders import save_policy
-from navrep_data.zoo.names import is_path
 from navrep_data.zoo.registry import Record, list_models
 from navrep_data.zoo.verification import Check, Report, verify
 
@@ -153,7 +153,7 @@ def load_sb3(name: str, source: str | os.PathLike[str] | None = None, env: Any =
     from navrep_data.zoo.sb3 import to_sb3
 
     model = to_sb3(load(name, source), env=env, **options)
-    place = is_path(name) and not name.startswith(_fetching.HUB_SCHEME)
+    place = is_path(name) and not name.startswith(HUB_SCHEME)
     # kept by save as plain text, so that a refusal to open the file can say how its controller comes back
     setattr(model, ORIGIN, str(Path(name).expanduser().absolute()) if place else name)
     return model

@@ -15,13 +15,12 @@ from pathlib import Path, PurePosixPath
 from urllib.parse import quote
 
 from navrep_data.errors import ConfigError, CorruptDataError, DownloadError, ModelNotFoundError, OfflineError
-from navrep_data.io import cache_dir, download, is_offline, safe_join
+from navrep_data.io import HUB_SCHEME, cache_dir, download, is_offline, safe_join
 from navrep_data.zoo import registry
 from navrep_data.zoo.registry import FileEntry, Record, resolve, with_parts
 
 DIR_VARIABLE = "NAVREP_RELEASED_DIR"
 URL_VARIABLE = "NAVREP_RELEASED_URL"
-HUB_SCHEME = "hf://"
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from navrep_data.errors import CheckpointError, ConfigError, ModelNotFoundError
-from navrep_data.io import atomic_write_json, read_json
+from navrep_data.io import HUB_SCHEME, atomic_write_json, is_path, read_json
 from navrep_data.sb3_file import refuse_sb3_file
 from navrep_data.schema import RobotContract, SensorContract
-from navrep_data.zoo.fetching import HUB_SCHEME
-from navrep_data.zoo.names import is_path
 
 if TYPE_CHECKING:
     from torch import nn

@@ -9,9 +9,6 @@ reachable, and changing a line of it is a change of format (CHANGELOG).
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 RELEASED = "released"
 OWN = "v1"
 
@@ -35,22 +32,6 @@ WILDCARDS = "*?["
 
 SHIPPED_BYTES = 45_000_000
 """The weights in the package take at most this much."""
-
-
-def is_path(name: str | os.PathLike[str]) -> bool:
-    """Return whether a model is named by its place: ``./folder``, ``hf://user/name``, ``FILE.safetensors``, a path."""
-    if not isinstance(name, str):
-        return True
-    return "/" in name or os.sep in name or name in (".", "..") or name.startswith("~") or name.endswith(".safetensors")
-
-
-def here_hint(name: str) -> str:
-    """Return a sentence on a file or folder that an unknown name may mean, empty where there is none.
-
-    A bare word is always a name of the zoo, so that no folder that happens to lie here changes what a command does.
-    """
-    bare = name and not is_path(name)
-    return f" There is a ./{name} here: to name that, write ./{name}." if bare and Path(name).exists() else ""
 
 
 def split_name(name: str) -> tuple[str, str | None]:

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data.errors import UnknownNameError, did_you_mean
-from navrep_data.io import FileId
-from navrep_data.zoo.names import OWN, RELEASED, WILDCARDS, alias_line, default_tag, here_hint, is_path, split_name
+from navrep_data.io import FileId, here_hint, is_path
+from navrep_data.zoo.names import OWN, RELEASED, WILDCARDS, alias_line, default_tag, split_name
 
 KINDS = ("policy", "controller", "world_model", "vae", "memory")
 FOLDER = Path(__file__).parent

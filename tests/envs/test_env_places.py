@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from env_cases import PHYSICS, make, make_vec, param, same
 
-from navrep_data.envs import NavRepEnv, goal_policy, record
+from navrep_data.envs import NavRepEnv, record
 from navrep_data.errors import ConfigError
 from navrep_data.sim import Simulator, make_config
 
@@ -40,7 +40,7 @@ def test_the_robot_starts_there_and_wants_to_go_there(env, physics):
 def test_empty_worlds_are_driven_from_start_to_goal(tmp_path):
     env = NavRepEnv("empty")
     film = record(
-        env, goal_policy, tmp_path / "a.gif", seed=1, options={"start": (-1.0, 0.5, 0.0), "goal": (1.5, 0.5)}, size=64
+        env, "goal", tmp_path / "a.gif", seed=1, options={"start": (-1.0, 0.5, 0.0), "goal": (1.5, 0.5)}, size=64
     )
     assert film.event == "goal"
     assert 10 <= film.steps <= 14

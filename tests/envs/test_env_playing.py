@@ -116,6 +116,16 @@ def test_restart_and_endings(hands):
     assert env._worlds.seeds[0] == 1010
 
 
+def test_a_policy_drives_while_no_key_is_down(hands):
+    env = NavRepEnv("navrep-test", episode=3, humans=0, obstacles=0)
+    assert drive(env, (person := hands([])).keyboard, person.window, episodes=1, speed=100.0, policy="goal") == ["goal"]
+    person = hands([(1, "press", "a"), (7, "press", "escape")])
+    drive(env, person.keyboard, person.window, options={"episode": 3}, speed=100.0, policy="goal")
+    trail = np.array(env._trail)[:, 0]
+    sideways = np.array([-np.sin(env._worlds.robots()[0, 2]), np.cos(env._worlds.robots()[0, 2])])
+    assert (trail[2] - trail[1]) @ sideways == pytest.approx(0.2), "the key counts"
+
+
 def test_closing_the_window_ends(hands):
     env = NavRepEnv("navrep-test")
     person = hands([(4, "close", None)])

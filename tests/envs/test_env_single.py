@@ -7,8 +7,9 @@ from env_cases import CASES, HAS_MAPS, KINDS, NUMBERED, PHYSICS, STREAMED, make,
 from gymnasium.utils.env_checker import check_env
 from recorded import reference
 
-from navrep_data.envs import NavRepEnv, goal_policy
+from navrep_data.envs import NavRepEnv
 from navrep_data.errors import ConfigError, UnknownNameError
+from navrep_data.policies import to_goal
 from navrep_data.registration import ENVIRONMENTS
 from navrep_data.sim import SimConfig, Simulator, make_config, numpy_seed
 
@@ -134,7 +135,7 @@ def endings(env, policy, episodes, **kwargs):
 
 
 def test_goal_and_collisions_terminate():
-    found = endings("navrep-test", goal_policy, 16, episode=0)
+    found = endings("navrep-test", lambda seen: to_goal(seen["robot_state"]), 16, episode=0)
     assert {event for event, *_ in found} == {"goal", "collision_human", "collision_obstacle"}
     for event, terminated, truncated, reward in found:
         assert (terminated, truncated) == (True, False)

@@ -7,8 +7,9 @@ import torch
 from env_cases import CASES, KINDS, is_numbered, labelled, make, make_vec, param, same
 from gymnasium.vector import AutoresetMode
 
-from navrep_data.envs import NavRepEnv, NavRepVectorEnv, goal_policy
+from navrep_data.envs import NavRepEnv, NavRepVectorEnv
 from navrep_data.errors import ConfigError
+from navrep_data.policies import to_goal
 from navrep_data.schema import Event
 
 STEPS = 60
@@ -194,7 +195,7 @@ def test_returned_arrays_are_the_callers():
     observations, infos = env.reset(seed=1)
     kept = observations["scan"].copy()
     for _ in range(3):
-        env.step(goal_policy(observations))
+        env.step(to_goal(observations["robot_state"]))
     assert same(observations["scan"], kept)
     infos["robot"][:] = np.nan
     assert np.isfinite(env.step(np.zeros((2, 3)))[4]["robot"]).all()

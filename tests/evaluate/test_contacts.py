@@ -11,12 +11,12 @@ from navrep_data.errors import ConfigError, SchemaVersionError
 from navrep_data.evaluate import METRICS, Contacts, Results, benchmark, get_suite, mcnemar, redraw
 from navrep_data.evaluate.executors import Job, run
 from navrep_data.evaluate.metrics import time_stopped
-from navrep_data.evaluate.policies import PilotSpec, resolve_policy
 from navrep_data.evaluate.results import header_of
 from navrep_data.evaluate.runner import _ContactCounter
 from navrep_data.evaluate.scores import compare, score, summary
 from navrep_data.evaluate.sources import find_benchmarks
 from navrep_data.evaluate.statistics import bootstrap_ratio
+from navrep_data.policies import PolicySpec, resolve_policy
 from navrep_data.schema import Event
 from navrep_data.sim import Simulator, make_config, scale_actions
 from navrep_data.sim import _layout as lay
@@ -155,7 +155,7 @@ def test_on_maps_contacts_are_those_of_legs_and_cells_in_plain_numpy(physics, ma
 
 
 def made_up(name, outcome, touched=(), suite="navreptest"):
-    results = Results(header_of(PilotSpec(name, "scan", name, "zoo"), get_suite(suite), "original"))
+    results = Results(header_of(PolicySpec(name, "scan", name, "zoo"), get_suite(suite), "original"))
     results._grow(len(outcome))
     results.outcome, results.steps = list(outcome), [10] * len(outcome)
     results.metrics = {m.name: [0.5] * len(outcome) for m in METRICS}

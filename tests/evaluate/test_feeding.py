@@ -6,12 +6,11 @@ import pytest
 from navrep_data.errors import ConfigError
 from navrep_data.evaluate import get_suite
 from navrep_data.evaluate.metrics import Contacts
-from navrep_data.evaluate.pilots import FunctionPilot, ZooPilot
-from navrep_data.evaluate.policies import PilotSpec, resolve_policy
 from navrep_data.evaluate.reproduce.testing import scores
 from navrep_data.evaluate.results import Results, file_name, header_of
 from navrep_data.evaluate.runner import play
 from navrep_data.evaluate.suite_worlds import SuiteWorlds
+from navrep_data.policies import Driver, FunctionPolicy, NetworkPolicy, PolicySpec, resolve_policy
 from navrep_data.schema import RobotContract, result_name
 from navrep_data.sim import make_config
 from navrep_data.testing import tiny_checkpoint
@@ -46,9 +45,9 @@ class Recording:
 
 def drive(policy, scaling="robot", steps=3, **changes):
     worlds = SuiteWorlds(make_config("navrep-test", physics="original", **changes), 2)
-    pilot = ZooPilot(policy, 1000, scaling) if isinstance(policy, Recording) else FunctionPilot("f", policy)
+    driver = Driver(NetworkPolicy(policy, first_seed=1000, scaling=scaling))
     todo = iter([[0], [1]])
-    played = play(SUITE, worlds, pilot, lambda: next(todo, None))
+    played = play(SUITE, worlds, driver, lambda: next(todo, None))
     for _ in range(steps):
         next(played)
     return policy
@@ -67,7 +66,7 @@ def test_a_function_with_observe_is_told_too():
     told = Function()
     worlds = SuiteWorlds(make_config("navrep-test", physics="original"), 2)
     todo = iter([[0], [1]])
-    next(play(SUITE, worlds, FunctionPilot("f", told), lambda: next(todo, None)))
+    next(play(SUITE, worlds, Driver(FunctionPolicy("f", told)), lambda: next(todo, None)))
     np.testing.assert_allclose(told.told, [[1.0, -0.5, 0.0]])
 
 
@@ -102,7 +101,7 @@ loaded = Loaded()
 def test_a_loaded_policy_in_a_module_is_fed_as_by_its_name():
     for spec in (resolve_policy(loaded), resolve_policy(f"{__name__}:loaded")):
         assert (spec.kind, spec.settings()) == ("object", {"ranges": "contract", "scaling": "robot"})
-        assert isinstance(spec.make(1000), ZooPilot)
+        assert isinstance(spec.make(), NetworkPolicy)
     assert resolve_policy(loaded, scaling="none").settings()["scaling"] == "none"
     assert resolve_policy(loaded.act).kind == "function"
     with pytest.raises(ConfigError, match="loaded already"):
@@ -158,7 +157,7 @@ def test_results_say_how_a_network_was_fed_in_header_name_and_file():
     ]
     noisy = {"inference": "as_released", "ranges": "as_released"}
     assert result_name("x", noisy) == "x (noise of the release, ranges as the authors fed them)"
-    assert "ranges" not in header_of(PilotSpec("goal", "goal only", "goal", "baseline"), SUITE, "original")["settings"]
+    assert "ranges" not in header_of(PolicySpec("goal", "goal only", "goal", "baseline"), SUITE, "original")["settings"]
 
 
 def test_runs_fed_as_the_authors_do_it_are_a_source_of_their_own():
@@ -191,9 +190,9 @@ def test_a_network_sees_the_office_as_long_as_its_contract(tmp_path, monkeypatch
 
     own = tiny_checkpoint(tmp_path / "own")
     suite = get_suite("navrep27")
-    pilot = resolve_policy(str(own)).make(0)
+    driver = Driver(resolve_policy(str(own)).make())
     worlds = SuiteWorlds(suite.config("original"), 27)
     todo = iter([[k] for k in range(27)])
-    next(play(suite, worlds, pilot, lambda: next(todo, None)))
+    next(play(suite, worlds, driver, lambda: next(todo, None)))
     assert max(seen for seen, _ in farthest) > 30.0
     assert max(fed for _, fed in farthest) <= 25.0

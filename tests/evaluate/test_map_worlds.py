@@ -6,9 +6,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from navrep_data.evaluate import get_suite, redraw
-from navrep_data.evaluate.baselines import OrcaPilot
 from navrep_data.evaluate.driver import benchmark
 from navrep_data.evaluate.suite_worlds import SuiteWorlds
+from navrep_data.policies import Driver, OrcaPolicy
 from navrep_data.schema import Event
 from navrep_data.sim import Simulator, scale_actions
 from navrep_data.sim.maps import load_map
@@ -35,7 +35,7 @@ def test_worlds_show_what_the_simulator_shows(physics):
     rng = np.random.default_rng(0)
     for step in range(12):
         to_human, to_static = worlds.gaps()
-        scans, states, poses = worlds.scans(), worlds.robot_states(), worlds.poses()
+        scans, states, poses = *worlds.simulator.observe(), worlds.poses()
         for w, sim in enumerate(single):
             scan, state = sim.observe()
             assert np.array_equal(scan[0], scans[w])
@@ -44,7 +44,7 @@ def test_worlds_show_what_the_simulator_shows(physics):
             here = poses[w] - [*sim.origins[0], 0.0]
             np.testing.assert_allclose(now.robot[:3], here, rtol=0.0, atol=1e-12)
             radius = now.robot[5]
-            assert worlds.radii()[w] == radius
+            assert worlds.simulator.radii()[w] == radius
             h = now.humans
             expected = np.inf
             if len(h):
@@ -53,11 +53,10 @@ def test_worlds_show_what_the_simulator_shows(physics):
                 assert to_human[w] == pytest.approx(expected, abs=0.2)
             static = sim.clearance(here[None, :2])[0] - radius
             assert min(to_static[w], 1.0) == pytest.approx(min(static, 1.0), abs=1e-6)
-        actions = np.zeros((len(CHOSEN), 3))
-        actions[:, :2] = rng.uniform(-1, 1, (len(CHOSEN), 2))
-        events = worlds.step(actions)
+        commands = scale_actions(config, rng.uniform(-1, 1, (len(CHOSEN), 2)))
+        events = worlds.step(commands)
         for w, sim in enumerate(single):
-            assert sim.step(scale_actions(config, actions[w : w + 1]))[1][0] == events[w]
+            assert sim.step(commands[w : w + 1])[1][0] == events[w]
 
 
 def slow_shortest(scenario):
@@ -102,9 +101,10 @@ def test_orca_finds_its_way_where_straight_ahead_does_not_lead_there():
     worlds = SuiteWorlds(SUITE.config("original"), 1)
     scenario = scenario_names().index("irosasl_office_j2")
     worlds.reset(np.ones(1, bool), np.array([scenario]), np.array([scenario]))
-    pilot, event = OrcaPilot(), 0
+    driver, event = Driver(OrcaPolicy()), 0
+    driver.start(worlds.simulator)
     while not event:
-        (event,) = worlds.step(np.clip(pilot.act(worlds), -1, 1))
+        (event,) = worlds.step(driver.commands(worlds.simulator))
     assert Event(int(event)) == Event.GOAL
 
 

@@ -12,7 +12,6 @@ from recorded import reference
 
 from navrep_data.errors import ConfigError, CorruptDataError, DatasetNotFoundError
 from navrep_data.evaluate.metrics import METRICS, Contacts
-from navrep_data.evaluate.policies import PilotSpec
 from navrep_data.evaluate.reproduce import FIGURES, reproduce
 from navrep_data.evaluate.reproduce.drawn import authors
 from navrep_data.evaluate.reproduce.testing import PARTS, scores
@@ -22,12 +21,13 @@ from navrep_data.evaluate.sources import find_benchmarks, source_of
 from navrep_data.evaluate.suites import get_suite
 from navrep_data.evaluate.world_model import WorldModelError
 from navrep_data.evaluate.world_model_results import save
+from navrep_data.policies import PolicySpec
 from navrep_data.testing import tiny_dataset
 
 
 def results(folder, name, outcome, suite="navrep27", variant=None, physics="original", **how):
     """Write a results file with the given outcome per episode."""
-    spec = PilotSpec(name, "scan", variant or name.partition(".")[0], "zoo", **how)
+    spec = PolicySpec(name, "scan", variant or name.partition(".")[0], "zoo", **how)
     found = Results(header_of(spec, get_suite(suite), physics))
     n = len(outcome)
     found.outcome, found.events, found.steps = list(outcome), ["goal"] * n, [10] * n

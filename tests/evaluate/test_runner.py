@@ -15,12 +15,11 @@ from navrep_data.errors import (
     UnknownNameError,
 )
 from navrep_data.evaluate import Results, benchmark, get_suite, redraw
-from navrep_data.evaluate.baselines import GoalPilot
 from navrep_data.evaluate.driver import write_report
 from navrep_data.evaluate.executors import Job, run
 from navrep_data.evaluate.metrics import measure
-from navrep_data.evaluate.policies import resolve_policy
 from navrep_data.evaluate.runner import TRAJECTORY_POINTS, n_worlds, thin, units
+from navrep_data.policies import GoalPolicy, resolve_policy, to_goal
 from navrep_data.schema import Event
 from navrep_data.sim import Simulator, make_config
 from navrep_data.testing import tiny_checkpoint
@@ -99,24 +98,19 @@ def test_the_goal_rule_gives_the_originals_control():
 
 
 def test_goal_fills_the_action_box_and_stands_at_the_goal():
-    class Fixed:
-        n = 3
-
-        def robot_states(self):
-            return np.float32([[4, 2, 0, 0, 0], [-0.1, 0.2, 0, 0, 0], [0, 0, 0, 0, 0]])
-
-    assert GoalPilot().act(Fixed()) == pytest.approx(np.array([[1, 0.5, 0], [-0.5, 1, 0], [0, 0, 0]]))
+    states = np.float32([[4, 2, 0, 0, 0], [-0.1, 0.2, 0, 0, 0], [0, 0, 0, 0, 0]])
+    assert to_goal(states) == pytest.approx(np.array([[1, 0.5, 0], [-0.5, 1, 0], [0, 0, 0]]))
 
 
 def test_units_and_rows_of_groups():
     assert units([5, 2], grouped=False) == [[5], [2]]
     assert units([0, 63, 64, 130], grouped=True) == [[0, 63], [64], [130]]
 
-    class Grouped(GoalPilot):
+    class Grouped(GoalPolicy):
         grouped = True
 
     assert n_worlds(Grouped(), 7, 3) == 64
-    assert n_worlds(GoalPilot(), 7, 3) == 3
+    assert n_worlds(GoalPolicy(), 7, 3) == 3
 
 
 def test_thin_keeps_first_and_last():

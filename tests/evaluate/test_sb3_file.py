@@ -13,8 +13,8 @@ from navrep_data import zoo
 from navrep_data.envs import make_sb3_vec
 from navrep_data.errors import CheckpointError, PolicyError
 from navrep_data.evaluate import benchmark
-from navrep_data.evaluate.policies import resolve_policy
 from navrep_data.generate.policy import make_policy
+from navrep_data.policies import resolve_policy
 from navrep_data.sb3_file import refuse_sb3_file
 from navrep_data.zoo.importers import load_any
 from navrep_data.zoo.local import load_any_model

@@ -7,9 +7,9 @@ import pytest
 from navrep_data.cli.models import _score
 from navrep_data.evaluate import get_suite
 from navrep_data.evaluate.metrics import METRICS, Contacts
-from navrep_data.evaluate.policies import resolve_policy
 from navrep_data.evaluate.results import Results, file_name, header_of
 from navrep_data.evaluate.sources import benchmark_entries
+from navrep_data.policies import resolve_policy
 from navrep_data.zoo import cards, measured, registry
 
 NAME = "e2e_1d.20201026"

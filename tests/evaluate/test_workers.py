@@ -13,7 +13,7 @@ from recorded import reference
 
 from navrep_data.evaluate import benchmark, wilson
 from navrep_data.evaluate.executors import Job, run
-from navrep_data.evaluate.policies import resolve_policy
+from navrep_data.policies import resolve_policy
 
 pytestmark = pytest.mark.slow  # seconds to a minute each; `make test` runs them
 

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from navrep_data.generate.plan import check_settings, make_request, versions
-from navrep_data.generate.policy import PolicySpec
+from navrep_data.generate.policy import make_policy
 from navrep_data.generate.worker import all_shards, make_shard, rollout_of
 from navrep_data.shards import read_worlds
 from navrep_data.sim import environment_names, make_config
@@ -91,7 +91,7 @@ def make(name: str, root: Path) -> dict[str, list[str]]:
     env, fields, options = RECIPES[name]
     options = dict(options)
     policy = options.pop("policy", "orca")
-    spec = PolicySpec(policy, 2, half_speed) if policy == "half_speed" else PolicySpec(policy)
+    spec = make_policy(half_speed if policy == "half_speed" else policy, 2)
     rows = {"scan_dtype": None, "rings": True, "humans": True, "labels": False} | options
     config = make_config(env, curriculum="constant", **fields)
     request = make_request(root, config, check_settings(config, LENGTH, **rows), spec, SEED, SEQUENCES, 8)

@@ -14,7 +14,7 @@ from PIL import Image
 from navrep_data.errors import DatasetMismatchError, MapError
 from navrep_data.generate import generate, merge_manifest, regenerate
 from navrep_data.generate.inputs import check_here, inputs_of
-from navrep_data.generate.policy import PolicySpec
+from navrep_data.generate.policy import make_policy
 from navrep_data.shards import Manifest
 from navrep_data.sim import load_map, make_config
 from navrep_data.sim.map_tables import map_world_data
@@ -92,17 +92,19 @@ def test_a_dataset_is_not_extended_by_an_edited_policy(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("what", ["map", "policy"])
-def test_workers_compare_what_they_find(here: Path, what: str) -> None:
+def test_workers_compare_what_they_find(here: Path, what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A node may have another map at the same path, or another module."""
     config = make_config("map", maps=("./m",), humans=0)
-    policy = PolicySpec("drives:drive", 1, lambda scan, state: np.zeros((len(scan), 2)))
+    monkeypatch.syspath_prepend(here / "a")
+    (here / "a" / f"drives_{what}.py").write_text(POLICY.format(speed=0.5))
+    policy = make_policy(f"drives_{what}:drive", 1)
     began = inputs_of(config, policy)
     assert set(began) == {"map:./m", "policy"}
     check_here(began, config, policy, "here")
     if what == "map":
         draw(here / "a" / "m", wall=9)
     else:
-        began["policy"] = "0" * 64
+        (here / "a" / f"drives_{what}.py").write_text(POLICY.format(speed=0.25))
     with pytest.raises(DatasetMismatchError, match=rf"The {what} .* has content \w{{12}} on node x, but the run began"):
         check_here(began, config, policy, "on node x")
 

@@ -5,7 +5,7 @@ import pytest
 
 from navrep_data.errors import ConfigError
 from navrep_data.schema import Event
-from navrep_data.sim import CallableRollout, RolloutSettings, ScriptedPolicy, ScriptedRollout, Simulator, make_config
+from navrep_data.sim import DrivenRollout, RolloutSettings, ScriptedPolicy, ScriptedRollout, Simulator, make_config
 from navrep_data.sim import _layout as lay
 from navrep_data.sim.lidar import scan_polygons
 
@@ -203,6 +203,6 @@ def test_scripted_policies_drive_all_robots_and_rows_are_the_firsts():
     assert np.hypot(*columns["humans"][1, sizes[0] - 1, 2:4]) > 0.1, "and driven afterwards"
 
 
-def test_python_policies_drive_one_robot():
-    with pytest.raises(ConfigError, match="robots=2 with a Python policy"):
-        CallableRollout(make_config("soadrl", robots=2), RolloutSettings(), lambda s, r: None, 0)
+def test_policies_that_are_asked_at_every_row_drive_one_robot():
+    with pytest.raises(ConfigError, match="robots=2 with a policy that drives one robot"):
+        DrivenRollout(make_config("soadrl", robots=2), RolloutSettings(), None, 0)

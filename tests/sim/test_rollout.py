@@ -5,8 +5,9 @@ import pytest
 
 from navrep_data.errors import PolicyError, UnknownNameError
 from navrep_data.observations import scan_to_rings
+from navrep_data.policies import Driver, FunctionPolicy
 from navrep_data.schema import Event
-from navrep_data.sim import CallableRollout, RolloutSettings, ScriptedPolicy, ScriptedRollout, make_config
+from navrep_data.sim import DrivenRollout, RolloutSettings, ScriptedPolicy, ScriptedRollout, make_config
 from navrep_data.sim.lidar import scan_polygons
 
 CONFIG = make_config("soadrl", humans=6, obstacles=4)
@@ -15,6 +16,10 @@ SETTINGS = RolloutSettings(length=150)
 
 def roll(policy="orca", sequence=0, seed=0, config=CONFIG, settings=SETTINGS):
     return ScriptedRollout(config, settings, ScriptedPolicy(policy), seed).run([sequence])[0]
+
+
+def driven(settings, function, seed, batch):
+    return DrivenRollout(CONFIG, settings, Driver(FunctionPolicy("f", function, batch)), seed, batch)
 
 
 def to_goal(scan, robot_state):
@@ -94,7 +99,7 @@ def test_python_policies_see_what_is_stored_and_groups_do_not_matter():
         return to_goal(scan, robot_state)
 
     settings = RolloutSettings(length=80)
-    four = CallableRollout(CONFIG, settings, policy, 1, batch=4).run([0, 1, 2, 3])
+    four = driven(settings, policy, 1, batch=4).run([0, 1, 2, 3])
     four = [({k: v.copy() for k, v in c.items()}, w) for c, w in four]
     assert len(seen) == 79
     assert seen[0][0].shape == (4, 1080)
@@ -102,7 +107,7 @@ def test_python_policies_see_what_is_stored_and_groups_do_not_matter():
         for w in range(4):
             np.testing.assert_array_equal(np.rint(seen[row][0][w].astype(float) * 1000), four[w][0]["scan"][row])
             np.testing.assert_array_equal(seen[row][1][w], four[w][0]["robot_state"][row])
-    pair = CallableRollout(CONFIG, settings, to_goal, 1, batch=4).run([2, 3])
+    pair = driven(settings, to_goal, 1, batch=4).run([2, 3])
     for a, b in zip(four[2:], pair, strict=True):
         for name, column in a[0].items():
             np.testing.assert_array_equal(column, b[0][name])
@@ -116,7 +121,7 @@ def test_scripted_and_python_rows_come_from_the_same_worlds():
     scripted, worlds = roll("constant-velocity", sequence=0, settings=settings)
     first_end = int(np.argmax(scripted["is_last"]))
     actions = iter(scripted["action"])
-    replay, replay_worlds = CallableRollout(CONFIG, settings, lambda s, r: next(actions)[None], 0, batch=1).run([0])[0]
+    replay, replay_worlds = driven(settings, lambda s, r: next(actions)[None], 0, batch=1).run([0])[0]
     for name in ("scan", "humans", "robot_pose", "reward", "event"):
         np.testing.assert_array_equal(replay[name][: first_end + 1], scripted[name][: first_end + 1])
     np.testing.assert_array_equal(replay_worlds["vertices"][:4], worlds["vertices"][:4])
@@ -140,7 +145,7 @@ def test_policies_with_memory_are_told_of_new_episodes():
             return to_goal(scan, robot_state)
 
     policy = Counting()
-    rows = CallableRollout(CONFIG, RolloutSettings(length=120), policy, 3, batch=2).run([0, 1])
+    rows = driven(RolloutSettings(length=120), policy, 3, batch=2).run([0, 1])
     assert policy.calls[0] == (2, None)
     starts = sum(int(c["is_first"][1:].sum()) for c, _ in rows)
     assert sum(int(m.sum()) for _, m in policy.calls[1:]) == starts > 0
@@ -155,7 +160,7 @@ def test_policies_with_memory_are_told_of_new_episodes():
 )
 def test_bad_policy_output_is_named(policy, words):
     with pytest.raises(PolicyError, match=words):
-        CallableRollout(CONFIG, RolloutSettings(length=5), policy, 0, batch=2).run([0, 1])
+        driven(RolloutSettings(length=5), policy, 0, batch=2).run([0, 1])
 
 
 def test_unknown_scripted_policy():

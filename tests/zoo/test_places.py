@@ -5,11 +5,11 @@ import shlex
 import pytest
 
 from navrep_data import zoo
-from navrep_data.errors import ModelNotFoundError, PolicyError, UnknownNameError
-from navrep_data.evaluate.policies import resolve_policy
+from navrep_data.errors import ModelNotFoundError, UnknownNameError
 from navrep_data.evaluate.sources import full_name, weights_of
 from navrep_data.generate.policy import make_policy
 from navrep_data.models import VAE, EndToEnd
+from navrep_data.policies import resolve_policy
 from navrep_data.testing import tiny_checkpoint
 from navrep_data.zoo.folders import place_of
 from navrep_data.zoo.local import described, load_any_model
@@ -72,9 +72,9 @@ def test_places(here, monkeypatch):
     assert full_name("e2e_1d") == "e2e_1d.v1"
 
 
-def test_generate_says_how_a_network_drives():
+def test_generate_takes_a_network_from_its_place(here, monkeypatch):
+    monkeypatch.setattr("navrep_data.zoo.hub.fetch_model", lambda text: here / "mine")
     for name in ("./mine", "hf://user/name"):
-        with pytest.raises(
-            PolicyError, match=r"zoo\.load\('" + name.replace(".", r"\.") + r"'\)` is named drive:policy"
-        ):
-            make_policy(name, 64)
+        policy = make_policy(name, 64)
+        assert policy.name == name
+        assert len(policy.content()) == 64

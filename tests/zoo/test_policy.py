@@ -14,8 +14,9 @@ from navrep_data.errors import ArrayError, CheckpointError, ConfigError, PolicyE
 from navrep_data.models import Controller, ControllerConfig, ModularWorldModel, VAEConfig, checkpoint
 from navrep_data.models.observation import observation_from_scan
 from navrep_data.models.vae import VAE
+from navrep_data.policies import Driver, NetworkPolicy
 from navrep_data.schema import SensorContract
-from navrep_data.sim import CallableRollout, RolloutSettings, make_config
+from navrep_data.sim import DrivenRollout, RolloutSettings, make_config
 from navrep_data.zoo.assemble import build
 from navrep_data.zoo.importers import load_controller_zip, load_tf_json, load_torch_world_model
 from navrep_data.zoo.policy import Policy
@@ -376,7 +377,7 @@ def test_a_policy_rolls_out_sequences_reproducibly(world_models):
     torch.nn.init.normal_(policy.network.mean.weight, std=2.0)
     runs = []
     for _ in range(2):
-        rollout = CallableRollout(config, RolloutSettings(length=30), policy, seed=3, batch=4)
+        rollout = DrivenRollout(config, RolloutSettings(length=30), Driver(NetworkPolicy(policy, 4)), seed=3, batch=4)
         runs.append([columns for columns, _ in rollout.run([0, 1])])
     for first, second in zip(*runs, strict=True):
         for name, column in first.items():

@@ -1,7 +1,7 @@
 """A policy keeps its contract: ranges are cut as in training, another robot is seen in the proportions of its own."""
 
 import json
-import re
+import sys
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from navrep_data import zoo
-from navrep_data.errors import CheckpointError, ConfigError, PolicyError
+from navrep_data.errors import CheckpointError, ConfigError
 from navrep_data.generate import generate
 from navrep_data.models import (
     Controller,
@@ -157,22 +157,23 @@ def test_records_say_what_robot_a_policy_was_trained_on(name):
 
 
 @pytest.mark.slow
-def test_what_generate_says_of_networks_is_so(tmp_path, monkeypatch):
-    """The file that the refusal tells one to write drives the robot of the environment at its speed."""
+@pytest.mark.parametrize("text", ["./mine", "drive_by_name:policy"])
+def test_data_of_a_network_is_of_the_environments_robot(text, tmp_path, monkeypatch):
+    """From its folder, or as an object in a module, it drives that robot at its speed and hears what was sent."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "drive_by_name", raising=False)
     policy = remembering()
     torch.nn.init.normal_(policy.network.mean.weight, std=3.0)
     zoo.save_policy(policy, tmp_path / "mine")
-    with pytest.raises(PolicyError, match="is named drive:policy") as refused:
-        generate(n=1, out=tmp_path / "d", policy="./mine")
-    (tmp_path / "drive.py").write_text(re.search("`(.*)`", str(refused.value))[1])
+    (tmp_path / "drive_by_name.py").write_text("from navrep_data import zoo\npolicy = zoo.load('./mine')\n")
     folder = tmp_path / "hall"
     folder.mkdir()
     Image.new("L", (100, 100), 254).save(folder / "m.png")
     (folder / "m.yaml").write_text(
         "image: m.png\nresolution: 0.2\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
-    settings = {"humans": 0, "length": 8, "scan_dtype": "float32", "policy": "drive:policy", "policy_batch": 1}
+    settings = {"humans": 0, "length": 8, "scan_dtype": "float32", "policy": text, "policy_batch": 1}
     generate("map", n=1, out=tmp_path / "d", workers=1, maps=[str(folder)], **settings)
     with DatasetFolder(tmp_path / "d") as made:
         scan, state, action = (made.read(name, 0, 0, 8) for name in ("scan", "robot_state", "action"))

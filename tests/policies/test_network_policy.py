@@ -2,12 +2,12 @@
 
 import gymnasium
 import numpy as np
-import pytest
-from PIL import Image
 
 from navrep_data.envs import record
+from navrep_data.policies import Driver, NetworkPolicy
+from navrep_data.policies.networks import knows_robots
 from navrep_data.schema import RobotContract
-from navrep_data.sim import CallableMapRollout, CallableRollout, RobotPolicy, RolloutSettings, knows_robots, make_config
+from navrep_data.sim import DrivenMapRollout, DrivenRollout, RolloutSettings, Simulator, make_config
 
 
 class Knowing:
@@ -33,15 +33,6 @@ class Knowing:
         self.told.append(executed[0])
 
 
-@pytest.fixture
-def hall(tmp_path):
-    Image.new("L", (100, 100), 254).save(tmp_path / "m.png")
-    (tmp_path / "m.yaml").write_text(
-        "image: m.png\nresolution: 0.2\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
-    )
-    return {"maps": (str(tmp_path),), "humans": 0}
-
-
 LENGTH = np.hypot(0.5, 1.0)  # on maps translations are no longer than 1
 SENT = [0.55 * 0.5 / LENGTH, -0.55 / LENGTH, 0.0]
 
@@ -59,14 +50,18 @@ def test_films_tell_a_policy_the_robot_and_what_it_was_sent(hall, tmp_path):
 
 def test_data_of_such_a_policy_is_in_metres_per_second(hall):
     policy = Knowing()
-    rollout = CallableMapRollout(make_config("map", **hall), RolloutSettings(length=4), policy, seed=1, batch=2)
+    rollout = DrivenMapRollout(
+        make_config("map", **hall), RolloutSettings(length=4), Driver(NetworkPolicy(policy, 2)), seed=1, batch=2
+    )
     columns = rollout.run([0, 1])[1][0]
     np.testing.assert_allclose(columns["action"][:3], [SENT] * 3, rtol=1e-6)
     (used,) = policy.used
     np.testing.assert_allclose(used.told, [SENT] * 3, rtol=1e-6)
     same = Knowing()
     config = make_config("navrep-train")
-    columns = CallableRollout(config, RolloutSettings(length=3), same, seed=1, batch=1).run([0])[0][0]
+    columns = DrivenRollout(config, RolloutSettings(length=3), Driver(NetworkPolicy(same, 1)), seed=1, batch=1).run(
+        [0]
+    )[0][0]
     np.testing.assert_allclose(columns["action"][:2], [[0.5, -1.0, 0.0]] * 2, rtol=1e-6)
     assert not same.used
     np.testing.assert_allclose(same.told, [[0.5, -1.0, 0.0]] * 2)
@@ -74,9 +69,11 @@ def test_data_of_such_a_policy_is_in_metres_per_second(hall):
 
 def test_a_robot_that_cannot_slide_turns_and_ranges_as_released_are_neither_scaled_nor_told(hall):
     policy = Knowing(ranges="as_released")
-    driver = RobotPolicy(policy, make_config("map", drive="differential", **hall))
-    driver.reset(batch_size=2)
-    commands = driver(np.ones((2, 1080), np.float32), np.zeros((2, 5), np.float32))
+    driver = Driver(NetworkPolicy(policy, 2))
+    simulator = Simulator(make_config("map", drive="differential", **hall), 2)
+    driver.start(simulator)
+    driver.reset(np.ones(2, bool), np.arange(2))
+    commands = driver.commands(simulator)
     np.testing.assert_allclose(commands, [[SENT[0], 0.0, -1.0]] * 2, rtol=1e-6)
     assert not policy.used
     assert not policy.told

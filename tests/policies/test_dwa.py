@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from navrep_data.evaluate import _dwa
-from navrep_data.evaluate.baselines import DwaPilot
-from navrep_data.schema import SensorContract
+from navrep_data.policies import Context, DwaPolicy, _dwa
+from navrep_data.schema import RobotContract, SensorContract
 
 RAYS = 1080
 SENSOR = SensorContract()
@@ -15,10 +14,9 @@ ANGLES = SENSOR.angle_min + SENSOR.angle_increment * np.arange(RAYS)
 
 
 def settings(**changes):
-    pilot = DwaPilot()
-    s = pilot._settings.copy()
-    s[_dwa.D_MAX_SPEED], s[_dwa.D_DT], s[_dwa.D_RANGE_MAX] = 1.0, 0.2, 25.0
-    s[_dwa.D_ANGLE_MIN], s[_dwa.D_ANGLE_INCREMENT] = SENSOR.angle_min, SENSOR.angle_increment
+    policy = DwaPolicy()
+    policy.start(Context(RobotContract(1.0, 0.3), SENSOR))
+    s = policy._settings.copy()
     for name, value in changes.items():
         s[getattr(_dwa, name)] = value
     return s
