@@ -71,7 +71,7 @@ bench-peers: $(STAMP)  ## Measure other simulators beside ours; writes benchmark
 PUBLISHED ?= data/published
 
 cards: $(STAMP)  ## Generate the datasets that we publish; writes their cards and pictures into cards/datasets.
-	$(BIN)/python -m navrep_data.datasets.cards cards/datasets --data $(PUBLISHED)
+	$(BIN)/python tools/dataset_cards.py cards/datasets --data $(PUBLISHED)
 
 docs: $(STAMP)  ## Build the documentation site into site/; any warning is an error.
 	rm -rf site

@@ -57,7 +57,8 @@ def main() -> int:
             continue
         module = open_alone(record, path)
         arrays = recorded(record, options.golden) or computed(record, module)
-        np.savez_compressed(out, **arrays, weights=outputs_of.weight_sums(module)[0])
+        kept: dict[str, Any] = {**arrays, "weights": outputs_of.weight_sums(module)[0]}
+        np.savez_compressed(out, **kept)
         found = compare_compact(record, module)
         worst = max(found, key=lambda c: c.error / c.tolerance)
         bad += not all(c.ok for c in found)

@@ -119,7 +119,7 @@ def _score(results: Sequence[dict[str, Any]], suite: str) -> str:
 def show_command(name: Annotated[str, typer.Argument(metavar="NAME|DIR")], as_json: Json = False) -> None:
     """Show what is known of a checkpoint: files, sizes, sensor, quirks, results; of a folder, what its JSON says."""
     from navrep_data.zoo import show
-    from navrep_data.zoo.cards import describe
+    from navrep_data.zoo.describe import describe
     from navrep_data.zoo.fetching import Source, missing_here
     from navrep_data.zoo.folders import place_of
 

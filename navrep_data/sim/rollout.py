@@ -57,7 +57,7 @@ def episode_seeds(
         Where they begin; the seeds of others are 0.
     """
     seeds = np.zeros(len(mask), np.int64)
-    for w in np.flatnonzero(mask):
+    for w in np.flatnonzero(mask).tolist():
         words = hashlib.blake2b(f"{seed} {sequences[w]} {episodes[w]}".encode(), digest_size=8)
         seeds[w] = int.from_bytes(words.digest(), "little") >> 1
     return seeds

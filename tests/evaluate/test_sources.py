@@ -10,7 +10,7 @@ from navrep_data.evaluate.metrics import METRICS, Contacts
 from navrep_data.evaluate.results import Results, file_name, header_of
 from navrep_data.evaluate.sources import benchmark_entries
 from navrep_data.policies import resolve_policy
-from navrep_data.zoo import cards, measured, registry
+from navrep_data.zoo import measured, registry
 
 NAME = "e2e_1d.20201026"
 COMMAND = f"navrep-data benchmark {NAME} --suite navreptest --episodes 3"
@@ -91,17 +91,20 @@ def test_lists_show_the_main_result_alone(entries):
 def test_no_two_rows_or_lines_of_a_card_say_the_same(entries, name, monkeypatch):
     from dataclasses import replace
 
-    from navrep_data.zoo import own_cards
+    import model_cards
+    from own_model_cards import own_card
+
+    from navrep_data.zoo.describe import describe
 
     maps = {"asl": 0.5}
     results = [{**e, "per_map": maps, "per_map_contact_free": maps, "command": "c"} for e in entries]
     for e in results:  # so that only what was played can tell them apart
         e.update({k: 0.5 for k in e if "rate" in k} | {"contacts_per_km": 1.0})
     record = replace(registry.find(name), results=tuple(json.loads(json.dumps(results))))
-    card = own_cards.own_card(record) if record.ours else cards._results([record])
+    card = own_card(record) if record.ours else model_cards._results([record])
     told = [line for line in card.splitlines() if "50.0%" in line]
     assert len(told) == len(set(told)) == len(results) * (3 if record.ours else 1)
-    described = [line for line in cards.describe(record) if line.startswith("result:")]
+    described = [line for line in describe(record) if line.startswith("result:")]
     assert len(described) == len(set(described)) == len(results)
     for words in ("original", "400 to 402", "contract, scaled", "as trained", "ranges as the authors fed them",
                   "noise of the release"):  # fmt: skip

@@ -4,13 +4,14 @@ import io
 from dataclasses import replace
 from pathlib import Path
 
+import dataset_cards as cards
 import h5py
 import numpy as np
 import pytest
 import yaml
 from PIL import Image
 
-from navrep_data.datasets import _hub_pictures, cards, pull, push
+from navrep_data.datasets import _hub_pictures, pull, push
 from navrep_data.datasets._hub_pictures import draw_pictures
 from navrep_data.datasets.tools import merge
 from navrep_data.errors import ConfigError, MissingExtraError
@@ -23,7 +24,7 @@ from navrep_data.testing import tiny_dataset
 FOLDER = Path(__file__).resolve().parents[2] / "cards" / "datasets"
 ENVS = sorted(cards.PUBLISHED)
 MAX_PICTURE_BYTES = 300_000
-AGAIN = "run: python -m navrep_data.datasets.cards cards/datasets"
+AGAIN = "run: python tools/dataset_cards.py cards/datasets"
 
 
 @pytest.fixture(scope="module")

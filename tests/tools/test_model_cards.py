@@ -3,26 +3,28 @@
 import dataclasses
 from pathlib import Path
 
+import model_cards
 import pytest
 import yaml
 
-from navrep_data.zoo import cards, registry
+from navrep_data.zoo import registry
+from navrep_data.zoo.describe import describe
 
 FOLDER = Path(__file__).resolve().parents[2] / "cards" / "models"
 VARIANTS = sorted(registry.variants())
 
 
 def test_cards_are_current(tmp_path):
-    made = {path.name: path.read_text() for path in cards.write_cards(tmp_path)}
+    made = {path.name: path.read_text() for path in model_cards.write_cards(tmp_path)}
     there = {path.name: path.read_text() for path in FOLDER.glob("*.md")}
-    assert set(made) == set(there), "run: python -m navrep_data.zoo.cards cards/models"
+    assert set(made) == set(there), "run: python tools/model_cards.py cards/models"
     stale = [name for name in made if made[name] != there[name]]
-    assert stale == [], "run: python -m navrep_data.zoo.cards cards/models"
+    assert stale == [], "run: python tools/model_cards.py cards/models"
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_card(variant):
-    text = cards.card(variant)
+    text = model_cards.card(variant)
     _, front, body = text.split("---\n", 2)
     head = yaml.safe_load(front)
     assert head["license"] == "mit"
@@ -44,7 +46,7 @@ def test_card(variant):
 
 def test_cards_tell_the_quirks_where_they_apply():
     def told(words):
-        return {v for v in VARIANTS if words in cards.card(v)}
+        return {v for v in VARIANTS if words in model_cards.card(v)}
 
     policies = {v for v, runs in registry.variants().items() if runs[-1].kind in ("policy", "controller")}
     assert told("Bang-bang control") == policies - {"e2e_1d_carch"}
@@ -59,7 +61,7 @@ def test_cards_tell_the_quirks_where_they_apply():
 
 
 def test_results_are_shown_with_command_and_baseline(monkeypatch):
-    assert "Not measured yet." in cards.card("modular_1d_z")
+    assert "Not measured yet." in model_cards.card("modular_1d_z")
     runs = registry.variants()["e2e_1d"]
     result = {
         "suite": "navreptest", "physics": "original", "episodes": 200, "rounds": "0 to 199",
@@ -67,21 +69,21 @@ def test_results_are_shown_with_command_and_baseline(monkeypatch):
         "command": "navrep-data benchmark zoo:e2e_1d.20201026 --suite navreptest",
     }  # fmt: skip
     measured = tuple(dataclasses.replace(r, results=(result,)) if r.tag == "20201026" else r for r in runs)
-    monkeypatch.setattr(cards, "variants", lambda: {"e2e_1d": measured})
-    text = cards.card("e2e_1d")
+    monkeypatch.setattr(model_cards, "variants", lambda: {"e2e_1d": measured})
+    text = model_cards.card("e2e_1d")
     assert (
         "| `e2e_1d.20201026` | navreptest | original | 200 (0 to 199) | ranges as the authors fed them | - | "
         "62.5% | - / 15.0% | `navrep-data benchmark zoo:e2e_1d.20201026 --suite navreptest` |"
     ) in text
     one = next(r for r in measured if r.tag == "20201026")
-    words = "\n".join(cards.describe(one))
+    words = "\n".join(describe(one))
     assert "success contact-free -, as released 62.5%; `goal` on the same episodes - and 15.0%" in words
 
 
 @pytest.mark.parametrize("name", sorted(registry.records()))
 def test_describe(name):
     record = registry.records()[name]
-    text = "\n".join(cards.describe(record))
+    text = "\n".join(describe(record))
     assert text.startswith(name)
     assert ("results: not measured yet" in text) == (not record.results)
     assert all(f.path in text for f in record.files)

@@ -1,9 +1,9 @@
-"""Cards of the datasets that this project publishes: ``python -m navrep_data.datasets.cards cards/datasets``.
+"""Cards of the datasets that this project publishes: ``python tools/dataset_cards.py cards/datasets``.
 
 Notes
 -----
 A card is a function of a manifest, so the manifests of what is published are kept beside the cards, with the pictures;
-tests check that the cards are what this module makes of them, that the pictures are those the manifests list, and
+tests check that the cards are what this script makes of them, that the pictures are those the manifests list, and
 that the package still generates the rows whose hashes the manifests hold. To add or renew one, change
 :data:`PUBLISHED` and run ``make cards``, which generates the datasets first.
 """
@@ -108,7 +108,6 @@ def generate(data: Path, envs: Iterable[str]) -> list[Path]:
     roots = []
     for env in envs:
         root = data / env
-        # a process of its own: this layer does not import the generators
         words = [sys.executable, "-m", "navrep_data", *shlex.split(PUBLISHED[env].command)[1:], "--out", str(root)]
         subprocess.run(words, check=True)
         roots.append(root)

@@ -7,7 +7,8 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from navrep_data.zoo._markdown import table
+from parts_of_cards import table
+
 from navrep_data.zoo.registry import Record, records
 
 _TRAINS = re.compile(r"navrep-data train (\S+)")

@@ -1,10 +1,10 @@
 """From a training's output folder to weights in this package: for its developers, in a checkout.
 
-``python -m navrep_data.train.shipping weights models/transformer_rings --as transformer_rings --data DIR`` writes
+``python tools/ship.py weights models/transformer_rings --as transformer_rings --data DIR`` writes
 ``zoo/weights/NAME/`` in half precision and the record ``zoo/records/NAME.json``, and fills in time and machine of the
-recipe. ``python -m navrep_data.train.shipping results NAME --results DIR`` then adds to the record what ``navrep-data
+recipe. ``python tools/ship.py results NAME --results DIR`` then adds to the record what ``navrep-data
 benchmark`` and ``navrep-data evaluate world-model --out`` measured of the shipped weights. Cards come last:
-``python -m navrep_data.zoo.cards cards/models``.
+``python tools/model_cards.py cards/models``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from navrep_data.zoo.names import OWN, SHIPPED_BYTES, UNTAGGED_ARE_OURS
 from navrep_data.zoo.policy import Policy
 from navrep_data.zoo.registry import FileEntry, Record
 
-RECIPES = Path(__file__).parent / "recipes"
+RECIPES = Path(state.__file__).parent / "recipes"
 STORAGE = "float16"
 _MAX_JSON = 1 << 20
 # What the metadata of a checkpoint keeps beside its weights; everything else is in the record.
@@ -354,7 +354,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
     import argparse
 
-    parser = argparse.ArgumentParser(prog="python -m navrep_data.train.shipping", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python tools/ship.py", description=__doc__.splitlines()[0])
     verbs = parser.add_subparsers(dest="verb", required=True)
     weights = verbs.add_parser("weights", help="a training's folder -> weights, record, recipe")
     weights.add_argument("folder", type=Path)
@@ -381,7 +381,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         record = add_results(given.name, given.results)
         for entry in record.results:
             print(entry)
-    print("next: python -m navrep_data.zoo.cards cards/models")
+    print("next: python tools/model_cards.py cards/models")
 
 
 if __name__ == "__main__":

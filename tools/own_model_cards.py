@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from navrep_data.zoo._markdown import table
+from parts_of_cards import front_matter, table, use
+from training_stages import earlier_stages, stages_table, supervision
+
+from navrep_data.shards.card import CITATION
+from navrep_data.zoo.describe import inputs, quirks, summary
 from navrep_data.zoo.measured import episodes, feeding, is_benchmark, played, share
 from navrep_data.zoo.names import RELEASED
 from navrep_data.zoo.registry import Record, dependants
-from navrep_data.zoo.stages import earlier_stages, stages_table, supervision
 
 FIRST_LINE = "Retrained by navrep-data; not the authors' checkpoint."
 _MACHINE = ("device", "processor", "cores", "threads", "torch")
@@ -124,16 +127,13 @@ def own_card(r: Record) -> str:
     r : Record
         Of a checkpoint that this project trained.
     """
-    from navrep_data.shards.card import CITATION
-    from navrep_data.zoo import cards
-
     users = sorted(d.name for d in dependants(r) if d.name != r.name)
     needs = [f"- {role}: `{name}`" for role, name in r.parts.items()]
     needs += [f"- used by: {', '.join(f'`{name}`' for name in users)}"] if users else []
     files = [(f"`navrep_data/zoo/{f.path}`", f"{f.bytes:,}", f"`{f.sha256}`") for f in r.files]
     sections = {
-        "Use": cards.use(r.name, r) + "\n\nThe weights are part of the package: nothing is fetched.",
-        "Inputs and outputs": table(("name", "shape", "meaning"), cards.inputs(r))
+        "Use": use(r.name, r) + "\n\nThe weights are part of the package: nothing is fetched.",
+        "Inputs and outputs": table(("name", "shape", "meaning"), inputs(r))
         + f"\n\nOther lidars: `navrep_data.observations.ScanAdapter`. One row is {r.sensor['dt']:g} s.",
         "Results": results(r),
         "Supervision": supervision(r) + f" {_BLIND_PEOPLE}",
@@ -141,7 +141,7 @@ def own_card(r: Record) -> str:
         "Half precision": half_precision(r),
         "Files": table(("file", "bytes", "SHA-256"), files),
         "Needs": "\n".join(needs) or "Nothing else.",
-        "Known quirks": "\n".join(f"- {text}" for text in [*cards.quirks(r), *r.notes]) or "None known.",
+        "Known quirks": "\n".join(f"- {text}" for text in [*quirks(r), *r.notes]) or "None known.",
         "Provenance": f"Trained by {r.source['trained_by']}, {r.source['license']} licence. navrep-data is an "
         "independent re-implementation, not made or endorsed by the NavRep authors; their checkpoint is "
         f"`{r.variant}.{RELEASED}`.",
@@ -150,5 +150,5 @@ def own_card(r: Record) -> str:
     body = "\n\n".join(f"## {title}\n\n{text}" for title, text in sections.items())
     sizes = {"z": r.z_size, "h": r.h_size, "parameters": r.n_parameters}
     facts = ", ".join(f"{key} {value:,}" for key, value in sizes.items() if value is not None)
-    head = f"{cards.front_matter(r.name, r)}\n\n# {r.name}\n\n{FIRST_LINE}"
-    return f"{head}\n\n{cards.summary(r)} Sizes: {facts}.\n\n{body}\n"
+    head = f"{front_matter(r.name, r)}\n\n# {r.name}\n\n{FIRST_LINE}"
+    return f"{head}\n\n{summary(r)} Sizes: {facts}.\n\n{body}\n"

@@ -6,7 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import ship
 import torch
+from model_cards import write_cards
+from own_model_cards import own_card
 
 from navrep_data import zoo
 from navrep_data.cli.main import run
@@ -23,9 +26,10 @@ from navrep_data.evaluate.world_model import world_model_error
 from navrep_data.evaluate.world_model_results import save
 from navrep_data.models import checkpoint
 from navrep_data.shards import dataset_record
-from navrep_data.train import controllers, default_controller_recipe, default_recipe, shipping, train_world_model
+from navrep_data.train import controllers, default_controller_recipe, default_recipe, train_world_model
 from navrep_data.train.half import rounding
-from navrep_data.zoo import cards, golden, names, own_cards, registry
+from navrep_data.zoo import golden, names, registry
+from navrep_data.zoo.describe import describe
 from navrep_data.zoo.local import load_any_model
 
 VARIANT = "transformer_1d"
@@ -60,7 +64,7 @@ def package(tmp_path, monkeypatch):
     shutil.copytree(registry.FOLDER / registry.RECORDS, root / registry.RECORDS)
     for path in (root / registry.RECORDS).glob(f"*.{names.OWN}.json"):
         path.unlink()
-    shutil.copytree(shipping.RECIPES, recipes)
+    shutil.copytree(ship.RECIPES, recipes)
     caches = (registry.records, registry.variants, registry.full_names)
     monkeypatch.setattr(registry, "FOLDER", root)
     monkeypatch.setattr(names, "UNTAGGED_ARE_OURS", names.UNTAGGED_ARE_OURS | {VARIANT, f"{VARIANT}_z"})
@@ -74,16 +78,16 @@ def package(tmp_path, monkeypatch):
         cached.cache_clear()
 
 
-def ship(trained, package, dataset):
+def both_shipped(trained, package, dataset):
     recipes = package.parent / "recipes"
-    w = shipping.ship(trained / "w", VARIANT, dataset, commands=COMMANDS, root=package, recipes=recipes)
-    c = shipping.ship(trained / "c", f"{VARIANT}_z", dataset, commands=[CONTROLLER], root=package, recipes=recipes)
+    w = ship.ship(trained / "w", VARIANT, dataset, commands=COMMANDS, root=package, recipes=recipes)
+    c = ship.ship(trained / "c", f"{VARIANT}_z", dataset, commands=[CONTROLLER], root=package, recipes=recipes)
     return w, c
 
 
 @pytest.mark.slow
 def test_shipped_weights_load_by_name_offline_and_say_whose_they_are(trained, package, dataset, capsys):
-    w, c = ship(trained, package, dataset)
+    w, c = both_shipped(trained, package, dataset)
     capsys.readouterr()
     policy = zoo.load(f"{VARIANT}_z")
     assert capsys.readouterr().err == (
@@ -120,7 +124,7 @@ def test_output_folders_load_by_path(trained, dataset, tmp_path):
 
 @pytest.mark.slow
 def test_the_world_model_is_stored_once_in_half_precision(trained, package, dataset):
-    w, c = ship(trained, package, dataset)
+    w, c = both_shipped(trained, package, dataset)
     files = sorted(str(p.relative_to(package)) for p in (package / "weights").rglob("*") if p.is_file())
     assert files == [f"weights/{n}/{f}" for n in (w.name, c.name) for f in ("config.json", "model.safetensors")]
     whole = (trained / "w" / "model.safetensors").stat().st_size
@@ -134,7 +138,7 @@ def test_the_world_model_is_stored_once_in_half_precision(trained, package, data
 
 @pytest.mark.slow
 def test_the_record_says_how_it_was_made(trained, package, dataset):
-    w, c = ship(trained, package, dataset)
+    w, c = both_shipped(trained, package, dataset)
     assert registry.records()[w.name] == w
     assert w.training["commands"] == COMMANDS
     assert w.training["dataset"]["content_hash"] == dataset_record(dataset)["content_hash"]
@@ -157,8 +161,8 @@ def test_the_record_says_how_it_was_made(trained, package, dataset):
 def test_stages_before_count(trained, package, dataset):
     recipes = package.parent / "recipes"
     options = {"commands": ["a", "b"], "root": package, "recipes": recipes}
-    alone = shipping.ship(trained / "w", VARIANT, dataset, **options).training
-    both = shipping.ship(trained / "w", VARIANT, dataset, before=[trained / "w"], **options).training
+    alone = ship.ship(trained / "w", VARIANT, dataset, **options).training
+    both = ship.ship(trained / "w", VARIANT, dataset, before=[trained / "w"], **options).training
     assert both["settings"] == alone["settings"]
     assert both["stages_before"] == [alone["settings"]]
     assert both["seconds"] >= alone["seconds"]
@@ -168,16 +172,16 @@ def test_stages_before_count(trained, package, dataset):
 def test_the_last_v_before_an_m_is_part_of_its_settings(tmp_path):
     def stage(seed, model=None):
         recipe = default_recipe("m" if model else "v", "1d").replace(seed=seed).to_dict()
-        return shipping._Training(tmp_path, model, None, {"recipe": recipe}, 10, 2.0)
+        return ship._Training(tmp_path, model, None, {"recipe": recipe}, 10, 2.0)
 
     joined = checkpoint.make("modular", {"lidar": "1d", "z_size": 8, "h_size": 8})
     stages = [stage(1), stage(2)]
-    found = shipping._recipe(tmp_path / "none.json", "modular_1d", stage(3, joined), ["..."], stages)
+    found = ship._recipe(tmp_path / "none.json", "modular_1d", stage(3, joined), ["..."], stages)
     assert (found["settings"]["v"]["seed"], found["settings"]["m"]["seed"]) == (2, 3)
     assert [one["seed"] for one in found["stages_before"]] == [1]
     assert found["wall_time_s"] == 6
     stages.append(stage(4, joined))  # M too went on from an earlier one
-    found = shipping._recipe(tmp_path / "none.json", "modular_1d", stage(3, joined), ["..."], stages)
+    found = ship._recipe(tmp_path / "none.json", "modular_1d", stage(3, joined), ["..."], stages)
     assert (found["settings"]["v"]["seed"], found["settings"]["m"]["seed"]) == (2, 3)
     assert [(one["model"], one["seed"]) for one in found["stages_before"]] == [("v", 1), ("m", 4)]
 
@@ -187,17 +191,17 @@ def test_a_v_alone_may_be_the_stage_before(trained, package, dataset, tmp_path):
     settings = default_recipe("v", "1d").replace(steps=1, batch=8, micro_batch=8, validate_batches=1)
     train_world_model(settings, dataset, tmp_path / "v", preload=True)
     options = {"commands": ["a", "b"], "root": package, "recipes": package.parent / "recipes"}
-    found = shipping.ship(trained / "w", VARIANT, dataset, before=[tmp_path / "v"], **options).training
+    found = ship.ship(trained / "w", VARIANT, dataset, before=[tmp_path / "v"], **options).training
     assert found["stages_before"] == [settings.to_dict()]
     with pytest.raises(CheckpointError, match="holds no training"):
-        shipping.ship(trained / "w", VARIANT, dataset, before=[tmp_path], **options)
+        ship.ship(trained / "w", VARIANT, dataset, before=[tmp_path], **options)
 
 
 @pytest.mark.slow
 def test_names_lists_and_checks_know_them(trained, package, dataset, capsys):
     with pytest.raises(UnknownNameError, match=rf"means {VARIANT}\.v1.*does not contain it.*{VARIANT}\.released"):
         zoo.load(VARIANT)
-    w, c = ship(trained, package, dataset)
+    w, c = both_shipped(trained, package, dataset)
     assert {w.name, f"{VARIANT}.released"} <= set(zoo.list_models(f"{VARIANT}*"))
     with pytest.raises(UnknownNameError, match=rf"here: {VARIANT}\.v1, {VARIANT}_z\.v1"):
         zoo.load("transformer_rings_z")
@@ -205,7 +209,7 @@ def test_names_lists_and_checks_know_them(trained, package, dataset, capsys):
     assert [p.is_relative_to(package) for p in zoo.fetch(c.name)] == [True] * 4
     report = zoo.verify(f"{VARIANT}*.v1")
     assert [(check.name, check.status) for check in report.checks] == [(w.name, "ok"), (c.name, "ok")]
-    assert "trained by navrep-data" in "\n".join(cards.describe(c))
+    assert "trained by navrep-data" in "\n".join(describe(c))
     with pytest.raises(SystemExit):
         run(["models", f"{VARIANT}_z*"])
     lines = capsys.readouterr().out.splitlines()
@@ -214,7 +218,7 @@ def test_names_lists_and_checks_know_them(trained, package, dataset, capsys):
 
 @pytest.mark.slow
 def test_a_damaged_file_is_refused(trained, package, dataset):
-    w, c = ship(trained, package, dataset)
+    w, c = both_shipped(trained, package, dataset)
     path = package / w.files[0].path
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
@@ -231,8 +235,8 @@ def test_a_damaged_file_is_refused(trained, package, dataset):
 
 @pytest.mark.slow
 def test_cards_say_first_whose_weights_they_are(trained, package, dataset, tmp_path):
-    w, c = ship(trained, package, dataset)
-    written = {path.name: path.read_text() for path in cards.write_cards(tmp_path / "cards")}
+    w, c = both_shipped(trained, package, dataset)
+    written = {path.name: path.read_text() for path in write_cards(tmp_path / "cards")}
     for record in (w, c):
         text = written[f"{record.name}.md"]
         body = text.split("---\n", 2)[2]
@@ -252,43 +256,43 @@ def results_of(record, folder, dataset):
 
 @pytest.mark.slow
 def test_measured_errors_reach_record_and_card(trained, package, dataset, tmp_path):
-    w, _ = ship(trained, package, dataset)
+    w, _ = both_shipped(trained, package, dataset)
     with pytest.raises(ConfigError, match="has no results of"):
-        shipping.add_results(w.name, tmp_path, root=package)
+        ship.add_results(w.name, tmp_path, root=package)
     path, found = results_of(w, tmp_path, dataset)
     for _ in range(2):  # the second replaces the first
-        record = shipping.add_results(w.name, tmp_path, root=package)
+        record = ship.add_results(w.name, tmp_path, root=package)
     assert len(record.results) == 1
     assert record.results[0]["scan_mse"] == pytest.approx(found.scan_mse, rel=1e-4)
-    assert f"`navrep-data evaluate world-model {w.name} --data DIR --split val`" in own_cards.own_card(record)
+    assert f"`navrep-data evaluate world-model {w.name} --data DIR --split val`" in own_card(record)
     save(found, tmp_path, dataset_record(dataset), weights_of(w.name), 9)
-    record = shipping.add_results(w.name, tmp_path, root=package)
-    assert f"{w.name} --data DIR --split val --limit 9`" in own_cards.own_card(record)
-    assert "MSE, val split" in "\n".join(cards.describe(record))
+    record = ship.add_results(w.name, tmp_path, root=package)
+    assert f"{w.name} --data DIR --split val --limit 9`" in own_card(record)
+    assert "MSE, val split" in "\n".join(describe(record))
     value = json.loads(path.read_text())
     value["files"] = dict.fromkeys(value["files"], "0" * 64)
     path.write_text(json.dumps(value))
     with pytest.raises(DatasetMismatchError, match="other weights"):
-        shipping.add_results(w.name, tmp_path, root=package)
+        ship.add_results(w.name, tmp_path, root=package)
 
 
 @pytest.mark.slow
 def test_benchmarks_reach_record_and_card_with_the_goal_beside(trained, package, dataset, tmp_path):
     from navrep_data.evaluate import benchmark
 
-    _, c = ship(trained, package, dataset)
+    _, c = both_shipped(trained, package, dataset)
     benchmark([c.name], "navreptest", episodes=3, out=tmp_path / "b", figures=False)
-    record = shipping.add_results(c.name, tmp_path / "b", root=package)
+    record = ship.add_results(c.name, tmp_path / "b", root=package)
     (entry,) = record.results
     assert entry["command"] == f"navrep-data benchmark {c.name} --suite navreptest --episodes 3"
     assert entry["episodes"] == 3
     assert 0 <= entry["goal_success_rate"] <= 1
-    card = own_cards.own_card(record)
+    card = own_card(record)
     assert "| navreptest | original | 3 (0 to 2) |" in card
     assert 0 <= entry["contact_free_rate"] <= entry["success_rate"]
     (tmp_path / "b" / "navreptest-original" / "goal.json").unlink()
     with pytest.raises(CorruptDataError, match="no results of 'goal'"):
-        shipping.add_results(c.name, tmp_path / "b", root=package)
+        ship.add_results(c.name, tmp_path / "b", root=package)
 
 
 @pytest.mark.slow
@@ -296,36 +300,34 @@ def test_what_does_not_belong_together_is_not_shipped(trained, package, dataset,
     recipes = package.parent / "recipes"
     options = {"root": package, "recipes": recipes}
     with pytest.raises(CheckpointError, match="is not shipped: ship that first"):
-        shipping.ship(trained / "c", f"{VARIANT}_z", dataset, commands=["c"], **options)
+        ship.ship(trained / "c", f"{VARIANT}_z", dataset, commands=["c"], **options)
     with pytest.raises(ConfigError, match=r"other settings than transformer_1d\.json has \(.*z_size"):
-        shipping.ship(trained / "w", VARIANT, dataset, **options)
+        ship.ship(trained / "w", VARIANT, dataset, **options)
     with pytest.raises(CheckpointError, match="holds a transformer_1d, expected a joint_1d"):
-        shipping.ship(trained / "w", "joint_1d", dataset, commands=["w"], **options)
+        ship.ship(trained / "w", "joint_1d", dataset, commands=["w"], **options)
     with pytest.raises(CheckpointError, match="holds no training"):
-        shipping.ship(tmp_path, VARIANT, dataset, commands=["w"], **options)
+        ship.ship(tmp_path, VARIANT, dataset, commands=["w"], **options)
     with monkeypatch.context() as patch:
-        patch.setattr(shipping, "SHIPPED_BYTES", 100_000)
+        patch.setattr(ship, "SHIPPED_BYTES", 100_000)
         with pytest.raises(ConfigError, match=r"expected 100,000 at most"):
-            shipping.ship(trained / "w", VARIANT, dataset, commands=["w"], **options)
+            ship.ship(trained / "w", VARIANT, dataset, commands=["w"], **options)
     assert not any(path.is_file() for path in (package / "weights").rglob("*")), "refused weights leave nothing"
-    w = shipping.ship(trained / "w", VARIANT, dataset, commands=["w"], **options)
+    w = ship.ship(trained / "w", VARIANT, dataset, commands=["w"], **options)
     torch.manual_seed(9)
     other = checkpoint.make("transformer", checkpoint.load(trained / "w").config)
     checkpoint.save(other, package / "weights" / w.name, storage="float16")
     with pytest.raises(CheckpointError, match="another world model than"):
-        shipping.ship(trained / "c", f"{VARIANT}_z", dataset, commands=["c"], **options)
+        ship.ship(trained / "c", f"{VARIANT}_z", dataset, commands=["c"], **options)
     shipped = {path: path.read_bytes() for path in package.rglob("*") if path.is_file()}
     with pytest.raises(NavrepDataError):  # its cost cannot be measured
-        shipping.ship(trained / "w", VARIANT, tmp_path / "nothing", commands=["again"], **options)
+        ship.ship(trained / "w", VARIANT, tmp_path / "nothing", commands=["again"], **options)
     assert {path: path.read_bytes() for path in package.rglob("*") if path.is_file()} == shipped
     # a controller on z alone goes with any memory behind the same V
     other = checkpoint.load(trained / "w")
     with torch.no_grad():
         other.z_head.weight += 1.0
     checkpoint.save(other, package / "weights" / w.name, storage="float16")
-    assert shipping.ship(trained / "c", f"{VARIANT}_z", dataset, commands=["c"], **options).parts == {
-        "world_model": w.name
-    }
+    assert ship.ship(trained / "c", f"{VARIANT}_z", dataset, commands=["c"], **options).parts == {"world_model": w.name}
 
 
 @pytest.mark.slow
@@ -362,7 +364,7 @@ def test_shipped_weights(record, monkeypatch, tmp_path):
         action = loaded.act(np.full((2, 1080), 5.0, np.float32), np.tile(np.float32([4, 0, 0, 0, 0]), (2, 1)))
         assert np.linalg.norm(action, axis=1).max() <= 1 + 1e-5
     assert {"commands", "settings", "seed", "seconds", "machine", "half_precision"} <= set(record.training)
-    assert record.results, "measure it: navrep-data benchmark, then python -m navrep_data.train.shipping results"
-    recipe = json.loads((shipping.RECIPES / f"{record.variant}.json").read_text())
+    assert record.results, "measure it: navrep-data benchmark, then python tools/ship.py results"
+    recipe = json.loads((ship.RECIPES / f"{record.variant}.json").read_text())
     assert (recipe["settings"], recipe["commands"]) == (record.training["settings"], record.training["commands"])
     assert str(Path.home()) not in json.dumps(record.to_dict())

@@ -3,8 +3,10 @@
 import dataclasses
 
 import pytest
+import training_stages as stages
+from own_model_cards import own_card
 
-from navrep_data.zoo import own_cards, registry, stages
+from navrep_data.zoo import registry
 
 OURS = sorted((r for r in registry.records().values() if r.ours), key=lambda r: r.name)
 WORLD_MODELS = [r for r in OURS if r.kind == "world_model"]
@@ -31,7 +33,7 @@ def test_a_v_that_was_told_where_people_are_says_so(record):
     text = stages.supervision(record)
     assert "trained with true positions of people" in text
     assert all(f"{k} of " in text for k in told)
-    assert "Supervision" in own_cards.own_card(record)
+    assert "Supervision" in own_card(record)
 
 
 def test_what_was_not_told_where_people_are_says_that():
@@ -48,7 +50,7 @@ def test_what_was_not_told_where_people_are_says_that():
 
 
 def test_a_controller_names_the_world_model_and_its_supervision():
-    text = own_cards.own_card(registry.records()["joint_1d_z.v1"])
+    text = own_card(registry.records()["joint_1d_z.v1"])
     assert "`joint_1d.v1`, whose V was trained with true positions of people" in text
     assert "These episodes chose the weights." in text
     assert "not looked at" not in text
