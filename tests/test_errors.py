@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from navrep_data import errors
-from navrep_data.doctor.installation import Check
+from navrep_data.doctor.installation import Finding
 from navrep_data.errors import (
     LONGEST_MESSAGE,
     ConfigError,
@@ -46,7 +46,7 @@ def test_text_that_steers_a_terminal_or_cannot_be_written():
 
 
 def test_findings_of_reports_are_lines_too():
-    for finding in (Problem("data/x.h5", "a\nb" * 4000), Check("python", "problem", "a\nb" * 4000)):
+    for finding in (Problem("data/x.h5", "a\nb" * 4000), Finding("python", "problem", "a\nb" * 4000)):
         assert len(finding.what) == LONGEST_MESSAGE
         assert "\n" not in finding.what
 

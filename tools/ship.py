@@ -30,7 +30,7 @@ from navrep_data.zoo import measured, registry
 from navrep_data.zoo.local import PARTS, POLICY_FILE, load_policy
 from navrep_data.zoo.names import OWN, SHIPPED_BYTES, UNTAGGED_ARE_OURS
 from navrep_data.zoo.policy import Policy
-from navrep_data.zoo.registry import FileEntry, Record
+from navrep_data.zoo.registry import Record, RecordFile
 
 RECIPES = Path(state.__file__).parent / "recipes"
 STORAGE = "float16"
@@ -112,7 +112,7 @@ def ship(
         new = Path(made) / name
         checkpoint.save(network, new, kept, storage=STORAGE)
         files = tuple(
-            FileEntry(f"{registry.WEIGHTS}/{name}/{path.name}", path.stat().st_size, sha256_file(path), None)
+            RecordFile(f"{registry.WEIGHTS}/{name}/{path.name}", path.stat().st_size, sha256_file(path), None)
             for path in checkpoint.paths(new)
         )
         total += sum(file.bytes or 0 for file in files)
@@ -249,7 +249,7 @@ def _rounded(training: _Training, target: Path, root: Path, parts: dict[str, str
 
 
 def _record(
-    variant: str, training: _Training, parts: dict[str, str], files: tuple[FileEntry, ...], recipe: dict[str, Any],
+    variant: str, training: _Training, parts: dict[str, str], files: tuple[RecordFile, ...], recipe: dict[str, Any],
     cost: Rounding,
 ) -> Record:  # fmt: skip
     policy, model = training.policy, training.model

@@ -40,7 +40,7 @@ def world_model_command(
     from navrep_data.cli.train import check_device, use_threads
     from navrep_data.evaluate import world_model as measure
     from navrep_data.evaluate import world_model_results as files
-    from navrep_data.evaluate.reproduce.formats import check_suffix
+    from navrep_data.evaluate.pictures import check_suffix
     from navrep_data.evaluate.sources import full_name, weights_of
     from navrep_data.shards import dataset_record
     from navrep_data.zoo.local import load_any_model

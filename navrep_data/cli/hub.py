@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from navrep_data.cli._common import print_json, say, show_progress
-from navrep_data.cli.entry import stop
+from navrep_data.cli.interrupt import stop
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Repo = Annotated[str, typer.Argument(metavar="USER/NAME", help="Repository on the Hugging Face Hub.")]

@@ -34,7 +34,7 @@ from navrep_data.cli import (
     view,
 )
 from navrep_data.cli._common import refused_output
-from navrep_data.cli.entry import INTERRUPTED, INTERRUPTED_LINE
+from navrep_data.cli.interrupt import INTERRUPTED, INTERRUPTED_LINE
 from navrep_data.errors import FileAccessError, NavrepDataError, did_you_mean, one_line
 from navrep_data.io import translate_os_error
 

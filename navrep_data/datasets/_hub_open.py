@@ -10,11 +10,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from navrep_data.datasets import _hub_client as client
 from navrep_data.datasets._hub_extras import check_shard_index, read_index
 from navrep_data.datasets._hub_store import ShardStore
 from navrep_data.datasets.hub import fetch_manifest, origin_of, parse_manifest
 from navrep_data.errors import ConfigError, NavrepDataError, check_whole
+from navrep_data.hub import client
 from navrep_data.io import atomic_write_json, cache_dir, is_offline, read_json
 from navrep_data.shards import (
     INDEX_FILE,

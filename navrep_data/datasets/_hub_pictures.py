@@ -32,7 +32,7 @@ Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
-class Episode:
+class FilmedEpisode:
     """The rows of one episode, and what stood around, None where that is not known."""
 
     rows: dict[str, Array]
@@ -112,7 +112,7 @@ def draw_pictures(folder: DatasetFolder) -> dict[str, bytes]:
     return {f"media/{name}-episode.gif": _moving(episode), f"media/{name}-scene.png": still(episode, row)}
 
 
-def _choose(folder: DatasetFolder) -> Episode | None:
+def _choose(folder: DatasetFolder) -> FilmedEpisode | None:
     """Return the longest of the first episodes that reached the goal, else of all; on maps the most crowded."""
     if folder.manifest.sensor.n_rays < 2:
         return None
@@ -131,15 +131,15 @@ def _choose(folder: DatasetFolder) -> Episode | None:
     return None if episode.world is None else episode
 
 
-def read_episode(folder: DatasetFolder, k: int) -> Episode:
+def read_episode(folder: DatasetFolder, k: int) -> FilmedEpisode:
     """Return episode `k` of ``folder.episodes``, without a world where not all is stored that drawing it needs."""
     e = folder.episodes
     shard, start, stop = int(e.shard[k]), int(e.start[k]), int(e.start[k] + e.length[k])
     rows = {name: folder.read(name, shard, start, stop) for name in _NEEDED if name in folder.manifest.columns}
     worlds = folder.worlds(shard) if set(_NEEDED) <= set(rows) else None
     if worlds is None or not np.isfinite(rows["robot_pose"]).all():  # imports do not know it
-        return Episode(rows, None, folder)
-    return Episode(rows, worlds.episode(int(np.flatnonzero(worlds.arrays["row"] == start)[0])), folder)
+        return FilmedEpisode(rows, None, folder)
+    return FilmedEpisode(rows, worlds.episode(int(np.flatnonzero(worlds.arrays["row"] == start)[0])), folder)
 
 
 def _crowd(folder: DatasetFolder, episodes: Episodes, k: int) -> int:
@@ -168,7 +168,7 @@ def _figure(width: float, height: float, mosaic: str, dpi: int, ratios: tuple[fl
     return figure, figure.subplot_mosaic(mosaic, width_ratios=list(ratios))
 
 
-def still(episode: Episode, row: int) -> bytes:
+def still(episode: FilmedEpisode, row: int) -> bytes:
     """Return a PNG of one row: its world (if known), scan and rings."""
     sensor = episode.folder.manifest.sensor
     if episode.world is not None:
@@ -186,7 +186,7 @@ def still(episode: Episode, row: int) -> bytes:
     return buffer.getvalue()
 
 
-def _frames(episode: Episode) -> Iterator[Any]:
+def _frames(episode: FilmedEpisode) -> Iterator[Any]:
     from PIL import Image
 
     assert episode.world is not None
@@ -203,7 +203,7 @@ def _frames(episode: Episode) -> Iterator[Any]:
         yield Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
 
 
-def _moving(episode: Episode) -> bytes:
+def _moving(episode: FilmedEpisode) -> bytes:
     from PIL import Image
 
     frames = list(_frames(episode))

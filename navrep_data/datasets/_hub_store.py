@@ -9,8 +9,8 @@ from pathlib import Path
 
 import filelock
 
-from navrep_data.datasets import _hub_client as client
 from navrep_data.errors import CorruptDataError, HubError
+from navrep_data.hub import client
 from navrep_data.io import is_offline, translate_os_error
 from navrep_data.shards import FileEntry, Shard, ShardEntry
 

@@ -10,9 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from navrep_data.datasets import _hub_client as client
 from navrep_data.datasets._hub_extras import make_extras
-from navrep_data.datasets._hub_upload import upload
 from navrep_data.errors import (
     ConfigError,
     CorruptDataError,
@@ -21,7 +19,9 @@ from navrep_data.errors import (
     DiskSpaceError,
     FolderInUseError,
 )
-from navrep_data.io import fsync_dir, json_bytes, read_json, safe_join, sha256_bytes, translate_os_error
+from navrep_data.hub import client
+from navrep_data.hub.upload import upload
+from navrep_data.io import fsync_dir, json_bytes, parse_repo, read_json, safe_join, sha256_bytes, translate_os_error
 from navrep_data.shards import (
     CARD_FILE,
     FILE_NAME,
@@ -161,7 +161,7 @@ def push(
     removed in the same commit; other people's commits in between are noticed, not overwritten.
     """
     root = Path(root)
-    name, branch = client.parse_repo(repo, revision)
+    name, branch = parse_repo(repo, revision)
     manifest = Manifest.read(root)
     if not manifest.complete:
         state = "is a part of a dataset" if manifest.partial else "is not finished"
@@ -317,7 +317,7 @@ def pull(
     A part is a dataset: its manifest lists what is there and says of how much; ``info``, ``verify`` and the loaders
     take it. A later pull into the same folder adds to it.
     """
-    name, asked = client.parse_repo(repo, revision)
+    name, asked = parse_repo(repo, revision)
     root = Path(out) if out is not None else Path("data") / name.split("/")[1]
     client.require_network(f"pull {name}")
     at = client.resolve(name, "dataset", asked, token)

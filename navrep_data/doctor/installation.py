@@ -59,7 +59,7 @@ COMFORTABLE_BYTES = 2 << 30
 
 
 @dataclass(frozen=True)
-class Check:
+class Finding:
     """One thing that was looked at.
 
     Attributes
@@ -80,7 +80,7 @@ class Check:
         object.__setattr__(self, "what", one_line(self.what))
 
 
-def check_installation(*, progress: Callable[[str], None] | None = None) -> list[Check]:
+def check_installation(*, progress: Callable[[str], None] | None = None) -> list[Finding]:
     """Check this installation.
 
     Parameters
@@ -90,10 +90,10 @@ def check_installation(*, progress: Callable[[str], None] | None = None) -> list
 
     Returns
     -------
-    list of Check
+    list of Finding
         In the order in which they were made; a problem never stops the others.
     """
-    found: list[Check] = []
+    found: list[Finding] = []
     for name, make in (
         ("python", _python),
         ("packages", _packages),
@@ -108,26 +108,26 @@ def check_installation(*, progress: Callable[[str], None] | None = None) -> list
         try:
             found += make()
         except Exception as error:  # what is broken here may raise anything, and that is what we came to tell
-            found.append(Check(name, "problem", f"could not be checked: {type(error).__name__}: {error}"))
+            found.append(Finding(name, "problem", f"could not be checked: {type(error).__name__}: {error}"))
     return found
 
 
-def _python() -> Iterator[Check]:
+def _python() -> Iterator[Finding]:
     version = platform.python_version_tuple()
     seen = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     first, last = PYTHONS
     here = (int(version[0]), int(version[1]))
     if here < first:
-        yield Check("python", "problem", f"{seen}, expected {first[0]}.{first[1]} or newer: make a new environment")
+        yield Finding("python", "problem", f"{seen}, expected {first[0]}.{first[1]} or newer: make a new environment")
     elif here > last:
-        yield Check("python", "note", f"{seen}, newer than {last[0]}.{last[1]}, the last one that was tried")
+        yield Finding("python", "note", f"{seen}, newer than {last[0]}.{last[1]}, the last one that was tried")
     else:
-        yield Check("python", "ok", seen)
+        yield Finding("python", "ok", seen)
 
 
-def _packages() -> Iterator[Check]:
+def _packages() -> Iterator[Finding]:
     """Check each package that is needed: there, new enough, not newer than what was tried, and importable."""
-    yield Check("navrep-data", "ok", f"{__version__} in {Path(__file__).parents[1]}")
+    yield Finding("navrep-data", "ok", f"{__version__} in {Path(__file__).parents[1]}")
     for requirement in _requirements(None):
         check = check_package(requirement)
         if check.status != "problem":
@@ -135,7 +135,7 @@ def _packages() -> Iterator[Check]:
                 importlib.import_module(_module(requirement.name))
             except Exception as error:  # a broken binary raises anything
                 again = f"pip install --force-reinstall {requirement.name}"
-                check = Check(requirement.name, "problem", f"cannot be imported ({error}): {again}")
+                check = Finding(requirement.name, "problem", f"cannot be imported ({error}): {again}")
         yield check
 
 
@@ -158,7 +158,7 @@ def _requirements(extra: str | None) -> list[Requirement]:
     return found
 
 
-def check_package(requirement: Requirement) -> Check:
+def check_package(requirement: Requirement) -> Finding:
     """Compare the installed version of a package with what is required and with what was tried.
 
     Parameters
@@ -170,21 +170,21 @@ def check_package(requirement: Requirement) -> Check:
     try:
         version = importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
-        return Check(
+        return Finding(
             name, "problem", f"is not installed, expected {requirement.specifier or 'any'}: pip install {name}"
         )
     if not requirement.specifier.contains(version, prereleases=True):
         wanted = f"{name}{requirement.specifier}"
-        return Check(name, "problem", f"{version}, expected {requirement.specifier}: pip install '{wanted}'")
+        return Finding(name, "problem", f"{version}, expected {requirement.specifier}: pip install '{wanted}'")
     limit = KNOWN_GOOD.get(name.lower())
     if limit is not None and Version(version) >= Version(limit.removeprefix("<")):
-        return Check(
+        return Finding(
             name, "note", f"{version}, newer than what was tried ({limit}); if something fails, try an older one"
         )
-    return Check(name, "ok", version)
+    return Finding(name, "ok", version)
 
 
-def _kernels() -> Iterator[Check]:
+def _kernels() -> Iterator[Finding]:
     """Check that kernels compile, and that they are kept for the next process."""
     import numba
     import numpy as np
@@ -194,25 +194,29 @@ def _kernels() -> Iterator[Check]:
 
     config: Any = numba.config  # untyped: its switches are set dynamically
     if config.DISABLE_JIT:
-        yield Check("kernels", "note", "NUMBA_DISABLE_JIT is set: all runs as plain Python, 100 times slower; unset it")
+        yield Finding(
+            "kernels", "note", "NUMBA_DISABLE_JIT is set: all runs as plain Python, 100 times slower; unset it"
+        )
         return
     folder = kernel_cache_folder()
     warm = sum(1 for _ in folder.glob("**/*.nbi"))  # before our own kernel below is compiled into it
     rings = scan_to_rings(np.full((1, 1080), 5.0, np.float32))
     if rings.shape != (1, 64, 64) or not (rings == 2).any():
-        yield Check("kernels", "problem", "a compiled kernel gave a wrong result: reinstall numba and llvmlite")
+        yield Finding("kernels", "problem", "a compiled kernel gave a wrong result: reinstall numba and llvmlite")
         return
     problem = _not_writable(folder)
     if problem:
-        yield Check(
+        yield Finding(
             "kernels", "problem",
             f"work, but cannot be kept in {folder} ({problem}): every process compiles for half a minute; set "
             "NAVREP_DATA_HOME to a folder that you may write",
         )  # fmt: skip
     elif not warm:
-        yield Check("kernels", "note", f"work; not compiled yet in {folder}: the first run takes half a minute longer")
+        yield Finding(
+            "kernels", "note", f"work; not compiled yet in {folder}: the first run takes half a minute longer"
+        )
     else:
-        yield Check("kernels", "ok", f"{warm} compiled in {folder}")
+        yield Finding("kernels", "ok", f"{warm} compiled in {folder}")
 
 
 def _not_writable(folder: Path) -> str:
@@ -225,32 +229,32 @@ def _not_writable(folder: Path) -> str:
         return error.strerror or type(error).__name__
 
 
-def _cache() -> Iterator[Check]:
+def _cache() -> Iterator[Finding]:
     folder = cache_dir()
     problem = _not_writable(folder)
     if problem:
         advice = "change its permissions, or set NAVREP_DATA_HOME to a folder that you may write"
-        yield Check("cache", "problem", f"{folder} cannot be written ({problem}): {advice}")
+        yield Finding("cache", "problem", f"{folder} cannot be written ({problem}): {advice}")
         return
     taken = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
-    yield Check("cache", "ok", f"{folder}, {taken / 1e6:,.1f} MB")
+    yield Finding("cache", "ok", f"{folder}, {taken / 1e6:,.1f} MB")
 
 
-def _disk() -> Iterator[Check]:
+def _disk() -> Iterator[Finding]:
     for name, folder in (("here", Path.cwd()), ("cache", cache_dir())):
         while not folder.exists():
             folder = folder.parent
         free = shutil.disk_usage(folder).free
         seen = f"{free / 1e9:,.1f} GB free in {folder}"
         if free < MIN_FREE_BYTES:
-            yield Check(f"disk ({name})", "problem", f"{seen}: too little to write anything; free some")
+            yield Finding(f"disk ({name})", "problem", f"{seen}: too little to write anything; free some")
         elif free < COMFORTABLE_BYTES:
-            yield Check(f"disk ({name})", "note", f"{seen}; a million rows take 1.7 GB")
+            yield Finding(f"disk ({name})", "note", f"{seen}; a million rows take 1.7 GB")
         else:
-            yield Check(f"disk ({name})", "ok", seen)
+            yield Finding(f"disk ({name})", "ok", seen)
 
 
-def _optional() -> Iterator[Check]:
+def _optional() -> Iterator[Finding]:
     """Say of each optional part whether it is there; one that is there must work."""
     try:
         extras = importlib.metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
@@ -259,33 +263,33 @@ def _optional() -> Iterator[Check]:
     for extra in sorted(set(extras) - set(NOT_FOR_USERS)):
         checks = [check_package(requirement) for requirement in _requirements(extra)]
         if not checks:
-            yield Check(f"[{extra}]", "note", "is not for this Python")
+            yield Finding(f"[{extra}]", "note", "is not for this Python")
             continue
         missing = [check.name for check in checks if "is not installed" in check.what]
         wrong = [f"{check.name} {check.what}" for check in checks if check.status == "problem"]
         if missing:
-            yield Check(
+            yield Finding(
                 f"[{extra}]", "note", f"not installed ({', '.join(missing)}): pip install 'navrep-data[{extra}]'"
             )
         elif wrong:
-            yield Check(f"[{extra}]", "problem", "; ".join(wrong))
+            yield Finding(f"[{extra}]", "problem", "; ".join(wrong))
         elif extra == "maps":
             yield _maps()
         else:
-            yield Check(f"[{extra}]", "ok", ", ".join(f"{check.name} {check.what}" for check in checks))
+            yield Finding(f"[{extra}]", "ok", ", ".join(f"{check.name} {check.what}" for check in checks))
 
 
-def _maps() -> Check:
+def _maps() -> Finding:
     from navrep_data.sim.maps import load_map, map_names
 
     names = map_names()
     load_map("asl")
-    return Check("[maps]", "ok", f"{len(names)} maps")
+    return Finding("[maps]", "ok", f"{len(names)} maps")
 
 
-def _network() -> Iterator[Check]:
+def _network() -> Iterator[Finding]:
     from navrep_data.io import is_offline
 
     if is_offline():
         names = [name for name in ("NAVREP_DATA_OFFLINE", "HF_HUB_OFFLINE") if os.environ.get(name)]
-        yield Check("network", "note", f"switched off by {', '.join(names)}: only what is on this machine is used")
+        yield Finding("network", "note", f"switched off by {', '.join(names)}: only what is on this machine is used")

@@ -13,8 +13,8 @@ from navrep_data.envs.worlds import (
     EVENT_LABELS,
     F64,
     TERMINAL,
+    EnvWorlds,
     Observation,
-    Worlds,
     action_space,
     make_env_config,
     observation_space,
@@ -98,7 +98,7 @@ class NavRepEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         fps = max(1, round(1.0 / self.config.sensor.dt))
         self.metadata = {"render_modes": available_render_modes(), "render_fps": fps}
         self._spec: Any = None
-        self._worlds = Worlds(self.config, 1, episode)
+        self._worlds = EnvWorlds(self.config, 1, episode)
         self._pad_humans = pad_humans
         self._running = False
         self.seen: Observation | None = None

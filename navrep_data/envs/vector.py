@@ -15,9 +15,9 @@ from navrep_data.envs.window import check_render_mode
 from navrep_data.envs.worlds import (
     F64,
     TERMINAL,
+    EnvWorlds,
     Mask,
     Observation,
-    Worlds,
     action_space,
     make_env_config,
     observation_space,
@@ -112,7 +112,7 @@ class NavRepVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[np.float32
         self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
         self._spec: Any = None
         self._most_steps = _at_least_one("max_episode_steps", max_episode_steps)
-        self._worlds = Worlds(self.config, num_envs, episode)
+        self._worlds = EnvWorlds(self.config, num_envs, episode)
         self._running = False
         self._steps = np.zeros(num_envs, np.int64)
         self._ended = np.zeros(num_envs, np.bool_)  # worlds that wait for their next episode

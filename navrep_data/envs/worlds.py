@@ -80,7 +80,7 @@ def own_spec(spec: Any, config: SimConfig, most_steps: int | None) -> Any:
     return spec
 
 
-class Worlds:
+class EnvWorlds:
     """A batch of worlds that play episodes one after the other.
 
     Parameters

@@ -5,7 +5,7 @@ from navrep_data.evaluate.metrics import METRICS, RATIOS, Contacts, Metric
 from navrep_data.evaluate.results import Results
 from navrep_data.evaluate.scores import compare, score, summary
 from navrep_data.evaluate.statistics import bootstrap, bootstrap_ratio, mcnemar, wilson
-from navrep_data.evaluate.suites import Scenario, Suite, get_suite, suite_names
+from navrep_data.evaluate.suites import Suite, SuiteScenario, get_suite, suite_names
 
 __all__ = [
     "METRICS",
@@ -14,8 +14,8 @@ __all__ = [
     "Contacts",
     "Metric",
     "Results",
-    "Scenario",
     "Suite",
+    "SuiteScenario",
     "benchmark",
     "bootstrap",
     "bootstrap_ratio",

@@ -5,7 +5,6 @@ Everything is drawn from results files; colours are those of Okabe and Ito, whic
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from navrep_data.evaluate.backdrops import Backdrop, backdrop
+from navrep_data.evaluate.pictures import save
 from navrep_data.evaluate.results import Results
 from navrep_data.evaluate.statistics import wilson
-from navrep_data.io import atomic_write_bytes
 from navrep_data.sim.scenarios import MAP_GROUPS
 
 Row = dict[str, Any]
@@ -37,7 +36,6 @@ global planning on the simple one."""
 MAX_ROWS = 8
 PANEL_CELLS = 220
 """Cells of a map across a panel: about as many as it has pixels."""
-DPI = 150
 
 
 def draw(
@@ -62,19 +60,6 @@ def draw(
         plain = "".join(c if c.isalnum() or c in "._-" else "-" for c in results.name)
         files.append(save(grid(results), folder / f"trajectories-{plain}.png"))
     return files
-
-
-def save(figure: Any, path: Path) -> Path:
-    """Write a figure as PNG and return the path."""
-    from PIL import Image
-
-    drawn, packed = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=DPI)
-    # a palette halves the size; and nothing of matplotlib's version is in it, so that equal results give equal bytes
-    picture = Image.open(drawn).convert("RGB")
-    picture.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(packed, "png", optimize=True)
-    atomic_write_bytes(path, packed.getvalue())
-    return path
 
 
 def new_figure(width: float, height: float) -> Any:

@@ -17,7 +17,7 @@ from navrep_data.sim.scenarios import MAP_GROUPS, get_scenario, scenario_names
 
 
 @dataclass(frozen=True)
-class Scenario:
+class SuiteScenario:
     """One recipe for worlds of a suite.
 
     Attributes
@@ -44,7 +44,7 @@ class Suite:
         One line on what it is.
     physics : str
         Default physics.
-    scenarios : tuple of Scenario
+    scenarios : tuple of SuiteScenario
         Episode k plays scenario ``k % len(scenarios)``.
     rounds : int
         Default number of episodes per scenario.
@@ -63,7 +63,7 @@ class Suite:
     name: str
     text: str
     physics: str
-    scenarios: tuple[Scenario, ...]
+    scenarios: tuple[SuiteScenario, ...]
     rounds: int
     max_rounds: int
     first_seed: int
@@ -135,7 +135,7 @@ NAVREPTEST = Suite(
     name="navreptest",
     text="the training environment's test: square crossing, procedural polygons, numpy seeds 1000 + k",
     physics="original",
-    scenarios=(Scenario("navrep-test"),),
+    scenarios=(SuiteScenario("navrep-test"),),
     rounds=200,
     max_rounds=500,  # crowd_sim.py: the case counter wraps there
     first_seed=1000,
@@ -165,7 +165,7 @@ NAVREP27 = Suite(
     name="navrep27",
     text="the paper's 27 scenarios on three maps, episode r of scenario i = numpy seed 27 r + i",
     physics="original",
-    scenarios=tuple(Scenario(name, get_scenario(name).map) for name in scenario_names()),
+    scenarios=tuple(SuiteScenario(name, get_scenario(name).map) for name in scenario_names()),
     rounds=300,
     max_rounds=100_000,
     first_seed=0,

@@ -129,7 +129,7 @@ def figure(results: Sequence[WorldModelError], path: Path | str) -> None:
     """
     from matplotlib.figure import Figure
 
-    from navrep_data.evaluate.reproduce.formats import check_suffix, write_picture
+    from navrep_data.evaluate.pictures import check_suffix, write_picture
 
     check_suffix(Path(path), False, "--figure")
     results = [r for r in results if r.scan_mse is not None]

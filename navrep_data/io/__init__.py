@@ -18,11 +18,12 @@ from navrep_data.io._files import (
 from navrep_data.io.download import FileId, download, git_blob_sha1, is_offline, switched_off
 from navrep_data.io.folders import new_folder
 from navrep_data.io.interrupts import without_interrupts
-from navrep_data.io.places import HUB_SCHEME, here_hint, is_path
+from navrep_data.io.places import HUB_SCHEME, REPO_NAME, here_hint, is_path, parse_repo
 
 __all__ = [
     "HUB_SCHEME",
     "PART_SUFFIX",
+    "REPO_NAME",
     "FileId",
     "atomic_write_bytes",
     "atomic_write_json",
@@ -35,6 +36,7 @@ __all__ = [
     "is_path",
     "json_bytes",
     "new_folder",
+    "parse_repo",
     "raise_refusal",
     "read_json",
     "reading",

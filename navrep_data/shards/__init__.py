@@ -11,6 +11,7 @@ from navrep_data.shards.entries import (
     SPLITS,
     FileEntry,
     Ranges,
+    SequenceSource,
     ShardEntry,
     count_in_split,
     count_of,
@@ -24,10 +25,9 @@ from navrep_data.shards.entries import (
 from navrep_data.shards.folder import DatasetFolder, Episodes, dataset_record, info
 from navrep_data.shards.lock import LOCK_FILE, writer_lock
 from navrep_data.shards.manifest import CARD_FILE, MANIFEST_FILE, Manifest
-from navrep_data.shards.origin import ORIGIN_FILE, REPO_NAME, Origin, read_origin
+from navrep_data.shards.origin import ORIGIN_FILE, Origin, read_origin
 from navrep_data.shards.reader import Shard
 from navrep_data.shards.recipe import ShardRecipe, read_recipe
-from navrep_data.shards.source import SequenceSource
 from navrep_data.shards.statistics import merge_statistics
 from navrep_data.shards.verify import Problem, VerifyReport, check_file, verify
 from navrep_data.shards.worlds import WORLD_FIELDS, EpisodeWorld, Worlds, read_worlds, take_episodes
@@ -41,7 +41,6 @@ __all__ = [
     "MANIFEST_FILE",
     "MAX_SHARD_BYTES",
     "ORIGIN_FILE",
-    "REPO_NAME",
     "SPLITS",
     "SPLIT_RULE",
     "WORLD_FIELDS",

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy.typing as npt
 
 from navrep_data.shards.card import dataset_card
-from navrep_data.shards.entries import SPLITS, ShardEntry
+from navrep_data.shards.entries import SPLITS, SequenceSource, ShardEntry
 from navrep_data.shards.manifest import Manifest
-from navrep_data.shards.source import SequenceSource
 from navrep_data.shards.writer import Columns, ShardWriter, publish
 
 

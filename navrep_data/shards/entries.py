@@ -7,13 +7,10 @@ import re
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 from navrep_data.errors import SchemaVersionError
 from navrep_data.schema import FORMAT_VERSION, OLDEST_FORMAT
-
-if TYPE_CHECKING:
-    from navrep_data.shards.source import SequenceSource
 
 SPLITS = ("train", "val", "test")
 SPLIT_RULE = "sequence % 10 == 1: val; sequence % 10 == 2: test; all others: train"
@@ -40,6 +37,27 @@ def shard_file(split: str, index: int) -> str:
 def worlds_file(split: str, index: int) -> str:
     """Return the name of the worlds file of shard `index` of a split inside the dataset folder."""
     return f"worlds/{split}-{index:05d}.npz"
+
+
+class SequenceSource(NamedTuple):
+    """Where a sequence came from.
+
+    Attributes
+    ----------
+    dataset : int
+        Position in the manifest's `source`.
+    sequence : int
+        Its number there.
+    row : int
+        Its first row, counted from the first row of that sequence.
+    content_hash : str
+        The whole sequence's :func:`navrep_data.shards.sequence_hash` there.
+    """
+
+    dataset: int
+    sequence: int
+    row: int
+    content_hash: str
 
 
 @dataclass(frozen=True)

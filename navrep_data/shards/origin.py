@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from navrep_data.errors import CorruptDataError
-from navrep_data.io import atomic_write_json, read_json
+from navrep_data.io import REPO_NAME, atomic_write_json, read_json
 from navrep_data.shards._fields import Fields
 
 ORIGIN_FILE = "origin.json"
 _MAX_BYTES = 1 << 16
 _COMMIT = re.compile(r"[0-9a-f]{40}")
-REPO_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
-"""What a repository is called: user/name."""
 
 
 @dataclass(frozen=True)

@@ -11,32 +11,12 @@ sequence from getting into two splits.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 from navrep_data.shards._fields import SHA256, Fields
+from navrep_data.shards.entries import SequenceSource
 
 MAX_INDEX = 1 << 31
-
-
-class SequenceSource(NamedTuple):
-    """Where a sequence came from.
-
-    Attributes
-    ----------
-    dataset : int
-        Position in the manifest's `source`.
-    sequence : int
-        Its number there.
-    row : int
-        Its first row, counted from the first row of that sequence.
-    content_hash : str
-        The whole sequence's :func:`navrep_data.shards.sequence_hash` there.
-    """
-
-    dataset: int
-    sequence: int
-    row: int
-    content_hash: str
 
 
 def parse_datasets(fields: Fields) -> tuple[dict[str, Any], ...]:

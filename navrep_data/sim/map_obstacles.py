@@ -39,7 +39,7 @@ from navrep_data.sim._obstacles import (
 )
 from navrep_data.sim.gridmap import GridMap
 
-__all__ = ["OrcaTables", "orca_table", "orca_tables"]
+__all__ = ["MapObstacles", "orca_table", "orca_tables"]
 
 DEFAULT_BUCKET = 1.0
 DEFAULT_TOLERANCE = 0.05
@@ -50,7 +50,7 @@ MAX_TABLE_BYTES = 1 << 30
 
 
 @dataclass(frozen=True, eq=False)
-class OrcaTables:
+class MapObstacles:
     """Obstacle edges of a map, bucket by bucket.
 
     Attributes
@@ -97,7 +97,7 @@ def orca_tables(
     tolerance: float = DEFAULT_TOLERANCE,
     radius: float = DEFAULT_RADIUS,
     bucket: float = DEFAULT_BUCKET,
-) -> OrcaTables:
+) -> MapObstacles:
     """Return the tables of a map.
 
     Parameters
@@ -116,7 +116,7 @@ def orca_tables(
 
     Returns
     -------
-    OrcaTables
+    MapObstacles
         Kept in memory with the map.
 
     Raises
@@ -133,14 +133,14 @@ def orca_tables(
     for name, value in (("reach", reach), ("bucket", bucket)):
         if not (math.isfinite(value) and value > 0.0):
             raise ConfigError(f"{name} is {value}, expected a positive number of metres: correct it.")
-    kept: dict[tuple[float, ...], OrcaTables] = grid.__dict__.setdefault("_orca_tables", {})
+    kept: dict[tuple[float, ...], MapObstacles] = grid.__dict__.setdefault("_orca_tables", {})
     key = (float(reach), float(tolerance), float(radius), float(bucket))
     if key not in kept:
         kept[key] = _build(grid, *key)
     return kept[key]
 
 
-def _build(grid: GridMap, reach: float, tolerance: float, radius: float, bucket: float) -> OrcaTables:
+def _build(grid: GridMap, reach: float, tolerance: float, radius: float, bucket: float) -> MapObstacles:
     links, fields = _edges(grid.contours(tolerance, radius=radius, unknown_is_solid=True))
     (left, right, low, high), open_ground = grid.extent, grid.ground(radius)
     columns, rows = math.ceil((right - left) / bucket), math.ceil((high - low) / bucket)
@@ -169,7 +169,7 @@ def _build(grid: GridMap, reach: float, tolerance: float, radius: float, bucket:
         edges_f[table, :, : len(edges)] = fields[:, edges]
         edges_i[table, :, : len(edges)] = _renumbered(links, edges)
     counts = np.array([len(edges) for edges in chosen], np.int64)
-    return OrcaTables(edges_f, edges_i, counts, index, left, low, bucket, reach)
+    return MapObstacles(edges_f, edges_i, counts, index, left, low, bucket, reach)
 
 
 def _edges(polygons: list[NDArray[np.float64]]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:

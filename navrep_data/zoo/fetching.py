@@ -15,9 +15,9 @@ from pathlib import Path, PurePosixPath
 from urllib.parse import quote
 
 from navrep_data.errors import ConfigError, CorruptDataError, DownloadError, ModelNotFoundError, OfflineError
-from navrep_data.io import HUB_SCHEME, cache_dir, download, is_offline, safe_join
+from navrep_data.io import HUB_SCHEME, cache_dir, download, is_offline, parse_repo, safe_join
 from navrep_data.zoo import registry
-from navrep_data.zoo.registry import FileEntry, Record, resolve, with_parts
+from navrep_data.zoo.registry import Record, RecordFile, resolve, with_parts
 
 DIR_VARIABLE = "NAVREP_RELEASED_DIR"
 URL_VARIABLE = "NAVREP_RELEASED_URL"
@@ -86,12 +86,10 @@ def _on_the_hub(text: str) -> Source:
     """Resolve ``hf://user/name[@revision]`` the way huggingface_hub does: its endpoint, its token."""
     from huggingface_hub import constants, get_token
 
-    repo, _, revision = text.removeprefix(HUB_SCHEME).partition("@")
-    if repo.count("/") != 1 or not all(repo.split("/")):
-        raise ConfigError(f"source is {text!r}, expected hf://user/name or hf://user/name@revision: check it.")
+    repo, revision = parse_repo(text)
     token = get_token()
     headers = {"Authorization": f"Bearer {token}"} if token else None
-    return Source(None, f"{constants.ENDPOINT}/{repo}/resolve/{quote(revision or 'main', safe='')}", headers)
+    return Source(None, f"{constants.ENDPOINT}/{repo}/resolve/{quote(revision, safe='')}", headers)
 
 
 def cache_folder() -> Path:
@@ -99,7 +97,7 @@ def cache_folder() -> Path:
     return cache_dir() / "released"
 
 
-def _in_folder(folder: Path, entry: FileEntry) -> Path | None:
+def _in_folder(folder: Path, entry: RecordFile) -> Path | None:
     """Find a file in the repository itself, in its models folder, or among files side by side."""
     path = PurePosixPath(entry.path)
     for name in (path, path.relative_to("models") if path.parts[0] == "models" else path, PurePosixPath(path.name)):
@@ -109,12 +107,12 @@ def _in_folder(folder: Path, entry: FileEntry) -> Path | None:
     return None
 
 
-def locate(entry: FileEntry, source: Source) -> tuple[Path | None, str | None]:
+def locate(entry: RecordFile, source: Source) -> tuple[Path | None, str | None]:
     """Look for a file on this machine.
 
     Parameters
     ----------
-    entry : FileEntry
+    entry : RecordFile
         Which file.
     source : Source
         Where.
@@ -135,14 +133,14 @@ def locate(entry: FileEntry, source: Source) -> tuple[Path | None, str | None]:
     return (cached, entry.id.mismatch(cached)) if cached.is_file() else (None, None)
 
 
-def get_file(record: Record, entry: FileEntry, source: Source, *, progress: bool | None = None) -> Path:
+def get_file(record: Record, entry: RecordFile, source: Source, *, progress: bool | None = None) -> Path:
     """Return the path of a checked file, downloaded if it must be.
 
     Parameters
     ----------
     record : Record
         The checkpoint that needs it.
-    entry : FileEntry
+    entry : RecordFile
         Which file.
     source : Source
         Where to look.
@@ -223,7 +221,7 @@ def fetch(name: str, source: str | os.PathLike[str] | None = None, *, progress: 
     return [path for r in with_parts(resolve(name)) for path in get_files(r, where, progress=progress).values()]
 
 
-def missing_here(record: Record, source: Source) -> list[tuple[Record, FileEntry]]:
+def missing_here(record: Record, source: Source) -> list[tuple[Record, RecordFile]]:
     """Return the files, of a record and its parts, that are not on this machine or are the wrong ones."""
     missing = []
     for part in with_parts(record):

@@ -11,10 +11,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from navrep_data.datasets import _hub_client as client
-from navrep_data.datasets._hub_upload import upload
 from navrep_data.errors import ConfigError, CorruptDataError, ModelNotFoundError
-from navrep_data.io import is_offline, json_bytes, read_json, sha256_file
+from navrep_data.hub import client
+from navrep_data.hub.upload import upload
+from navrep_data.io import is_offline, json_bytes, parse_repo, read_json, sha256_file
 from navrep_data.models import checkpoint
 from navrep_data.shards import CARD_FILE, FileEntry
 from navrep_data.shards.card import CITATION
@@ -88,7 +88,7 @@ def push_model(
     HubError, OfflineError
         If the Hub refuses or cannot be reached.
     """
-    name, branch = client.parse_repo(repo, revision)
+    name, branch = parse_repo(repo, revision)
     if license is None:
         raise ConfigError(
             f"{os.fspath(path)} has no licence, expected one to publish it under: --license mit (or other)."

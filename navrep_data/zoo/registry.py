@@ -29,7 +29,7 @@ RECORDS, WEIGHTS = "records", "weights"
 
 
 @dataclass(frozen=True)
-class FileEntry:
+class RecordFile:
     """One file of a checkpoint.
 
     Attributes
@@ -94,7 +94,7 @@ class Record:
         Role (world_model, vae, memory) to full name of the checkpoints that this one needs.
     format : str or None
         sb2-zip, torch-state-dict or tf-json; safetensors for our own; None for a checkpoint without files of its own.
-    files : tuple of FileEntry
+    files : tuple of RecordFile
         Files to fetch and check.
     source : dict
         Repository, commit, license and the authors' words for the variant; for our own who trained it and license.
@@ -133,7 +133,7 @@ class Record:
     context_rule: str | None
     parts: dict[str, str]
     format: str | None
-    files: tuple[FileEntry, ...]
+    files: tuple[RecordFile, ...]
     source: dict[str, Any]
     started: str | None
     saved: str | None
@@ -153,7 +153,7 @@ class Record:
                 f"Record {data.get('name')!r} has the wrong keys {sorted(wrong)}: reinstall navrep-data."
             )
         lists = {key: tuple(data[key]) for key in ("golden", "notes", "results")}
-        return cls(**{**data, **lists, "files": tuple(FileEntry(**entry) for entry in data["files"])})
+        return cls(**{**data, **lists, "files": tuple(RecordFile(**entry) for entry in data["files"])})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the record as plain JSON values."""

@@ -183,7 +183,7 @@ def test_offline_is_told(monkeypatch):
 
 @pytest.mark.slow
 def test_the_command(monkeypatch, capsys):
-    ok, bad = installation.Check("a", "ok", "1.0"), installation.Check("b", "problem", "is gone: get it")
+    ok, bad = installation.Finding("a", "ok", "1.0"), installation.Finding("b", "problem", "is gone: get it")
     for checks, code, last in (([ok], 0, "all well"), ([ok, bad], 1, "1 problems")):
         monkeypatch.setattr("navrep_data.doctor.check_installation", lambda checks=checks: checks)
         with pytest.raises(SystemExit) as ended:

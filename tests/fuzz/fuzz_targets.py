@@ -494,7 +494,7 @@ def _make_model_list(folder: Path) -> None:
 
 
 def _read_model_list(folder: Path) -> None:
-    from navrep_data.datasets._hub_client import Revision
+    from navrep_data.hub.client import Revision
     from navrep_data.zoo.hub import _wanted
     from navrep_data.zoo.verification import _arrays
 

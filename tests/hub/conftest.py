@@ -12,7 +12,8 @@ from huggingface_hub import constants, file_download
 from huggingface_hub.utils import _http
 from shards.synthetic import make_dataset
 
-from navrep_data.datasets import _hub_client, _hub_extras
+from navrep_data.datasets import _hub_extras
+from navrep_data.hub import client
 
 
 @pytest.fixture
@@ -25,10 +26,10 @@ def quick(monkeypatch):
     pauses: list[float] = []
     clock = types.SimpleNamespace(**{name: getattr(time, name) for name in ("time", "monotonic", "perf_counter")})
     clock.sleep = pauses.append
-    for module in (_hub_client, _http, file_download):
+    for module in (client, _http, file_download):
         monkeypatch.setattr(module, "time", clock)
     for module, name in (
-        (_hub_client, "SILENCE"), (constants, "HF_HUB_DOWNLOAD_TIMEOUT"), (constants, "HF_HUB_ETAG_TIMEOUT"),
+        (client, "SILENCE"), (constants, "HF_HUB_DOWNLOAD_TIMEOUT"), (constants, "HF_HUB_ETAG_TIMEOUT"),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, 60.0)
     return pauses
@@ -58,7 +59,7 @@ def hub(monkeypatch, tmp_path, quick):
 def impatient(hub, monkeypatch, request):
     """Silence is noticed soon, 2 s or the parameter [s], of a request that is going to stall and of no other."""
     seconds = getattr(request, "param", 2.0)
-    bound = _hub_client._bound
+    bound = client._bound
 
     def shorter(asked):
         bound(asked)
@@ -67,7 +68,7 @@ def impatient(hub, monkeypatch, request):
             limits = asked.extensions["timeout"]
             asked.extensions["timeout"] = {**limits, "read": min(limits["read"], seconds)}
 
-    monkeypatch.setattr(_hub_client, "_bound", shorter)
+    monkeypatch.setattr(client, "_bound", shorter)
 
 
 @pytest.fixture

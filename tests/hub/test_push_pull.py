@@ -15,8 +15,8 @@ from huggingface_hub import constants
 from shards.synthetic import make_dataset
 from warm_process import WarmProcess
 
-from navrep_data.datasets import _hub_client, pull, push
 from navrep_data.datasets import hub as module
+from navrep_data.datasets import pull, push
 from navrep_data.datasets.hub import parse_shards
 from navrep_data.datasets.tools import _pieces, filter, merge
 from navrep_data.errors import (
@@ -30,6 +30,7 @@ from navrep_data.errors import (
     HubError,
     OfflineError,
 )
+from navrep_data.hub import client
 from navrep_data.io import json_bytes, sha256_file
 from navrep_data.shards import DatasetFolder, Manifest, content_hash, info, verify
 from navrep_data.shards.manifest import _hash
@@ -538,7 +539,7 @@ def test_a_repository_without_a_dataset(hub, pushed, tmp_path):
 def test_a_server_that_sends_without_end(hub, pushed, tmp_path, monkeypatch):
     """It announces the right size and sends more, without a length; what it sends is bounded."""
     shard = hub.repo(REPO).files()["data/train-00000.h5"]
-    monkeypatch.setattr(_hub_client, "_SLACK", 1000)
+    monkeypatch.setattr(client, "_SLACK", 1000)
     import hashlib
 
     import hub_server

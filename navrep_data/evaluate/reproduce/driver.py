@@ -7,8 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from navrep_data.errors import ConfigError, DatasetNotFoundError, did_you_mean
+from navrep_data.evaluate.pictures import check_suffix
 from navrep_data.evaluate.reproduce.drawn import Drawn, Missing, Reproduced
-from navrep_data.evaluate.reproduce.formats import check_suffix, write
+from navrep_data.evaluate.reproduce.formats import write
 from navrep_data.evaluate.reproduce.state import state
 from navrep_data.evaluate.reproduce.testing import table, testing, trajectories
 from navrep_data.evaluate.reproduce.training import training

@@ -8,32 +8,14 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from navrep_data.errors import ConfigError
-from navrep_data.evaluate.figures import save
+from navrep_data.evaluate.pictures import write_picture
 from navrep_data.evaluate.reproduce.drawn import Drawn
 from navrep_data.io import atomic_write_bytes
 
-PICTURES = (".png", ".pdf", ".svg")
-TABLES = (".md", ".tex", ".csv")
 _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _LATEX |= {c: f"\\{c}" for c in "&%$#_{}"}
 _UNSAFE = re.compile("[" + re.escape("".join(_LATEX)) + "]")
-
-
-def check_suffix(path: Path, is_table: bool, flag: str = "--out") -> None:
-    """Refuse a file whose suffix names no format; `flag` is what the file was given by.
-
-    Raises
-    ------
-    ConfigError
-        Naming those that there are.
-    """
-    known = TABLES if is_table else PICTURES
-    if path.suffix.lower() not in known:
-        what = "a table" if is_table else "a figure"
-        raise ConfigError(f"{flag} is {path}, expected a name for {what} that ends in {', '.join(known)}.")
 
 
 def write(drawn: Drawn, path: Path) -> None:
@@ -44,25 +26,6 @@ def write(drawn: Drawn, path: Path) -> None:
         atomic_write_bytes(path, as_text[suffix](drawn).encode())
     else:
         write_picture(drawn.figure, path)
-
-
-def write_picture(figure: Any, path: Path) -> None:
-    """Write a matplotlib figure, in the format of the suffix."""
-    suffix = path.suffix.lower()
-    if suffix == ".png":
-        save(figure, path)
-    else:
-        atomic_write_bytes(path, _vector(figure, suffix[1:]))
-
-
-def _vector(figure: Any, kind: str) -> bytes:
-    import matplotlib
-
-    # equal results give equal bytes: no date, and identifiers that are not random
-    with matplotlib.rc_context({"svg.hashsalt": "navrep-data", "pdf.fonttype": 42}):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=kind, metadata={"Date": None} if kind == "svg" else {"CreationDate": None})
-    return buffer.getvalue()
 
 
 def numbers(drawn: Drawn) -> str:

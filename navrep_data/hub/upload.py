@@ -6,8 +6,8 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from navrep_data.datasets import _hub_client as client
 from navrep_data.errors import CorruptDataError, HubError
+from navrep_data.hub import client
 from navrep_data.shards import FileEntry
 
 

@@ -14,9 +14,16 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from navrep_data.errors import ConfigError, CorruptDataError, HubError, NavrepDataError, OfflineError
-from navrep_data.io import HUB_SCHEME, atomic_write_bytes, is_offline, sha256_file, switched_off, translate_os_error
-from navrep_data.shards import REPO_NAME, FileEntry
+from navrep_data.errors import CorruptDataError, HubError, NavrepDataError, OfflineError
+from navrep_data.io import (
+    atomic_write_bytes,
+    is_offline,
+    parse_repo,
+    sha256_file,
+    switched_off,
+    translate_os_error,
+)
+from navrep_data.shards import FileEntry
 
 Kind = Literal["dataset", "model"]
 T = TypeVar("T")
@@ -33,7 +40,6 @@ FILES_AT_ONCE, BYTES_AT_ONCE = 16, 512 << 20
 THREADS = 4
 _SLACK = 1 << 20
 _BUSY = frozenset({408, 425, 429, 500, 502, 503, 504})
-_REVISION = re.compile(r"[A-Za-z0-9][A-Za-z0-9._/-]{0,254}")
 COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
@@ -78,25 +84,6 @@ class RemoteFile:
 
     bytes: int
     sha256: str | None
-
-
-def parse_repo(text: str, revision: str | None = None) -> tuple[str, str]:
-    """Return repository and revision of ``[hf://]user/name[@revision]``.
-
-    Raises
-    ------
-    ConfigError
-        If it is no such name, or names two revisions.
-    """
-    repo, at, found = text.removeprefix(HUB_SCHEME).partition("@")
-    if not REPO_NAME.fullmatch(repo) or ".." in repo or "--" in repo:
-        raise ConfigError(f"The repository is {text!r}, expected user/name as on the Hub.")
-    if at and revision is not None and found != revision:
-        raise ConfigError(f"{text!r} names a revision, and another one is given ({revision!r}): leave one out.")
-    chosen = found if at else "main" if revision is None else revision
-    if not _REVISION.fullmatch(chosen) or ".." in chosen:
-        raise ConfigError(f"The revision is {chosen!r}, expected a branch, tag or commit.")
-    return repo, chosen
 
 
 def require_network(what: str) -> None:
