@@ -1,4 +1,4 @@
-"""Names, shapes, dtypes and units of everything that is stored: format version 1.
+"""Names, shapes, dtypes and units of everything that is stored: format version 2.
 
 Notes
 -----

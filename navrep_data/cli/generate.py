@@ -133,7 +133,7 @@ def generate_command(
 
 
 def _print_summary(result: GenerateResult) -> None:
-    episodes = max(1, sum(result.outcomes.values()))
+    episodes = sum(result.outcomes.values())
     outcomes = ", ".join(f"{name} {100 * count / episodes:.0f} %" for name, count in result.outcomes.items() if count)
     part = "" if result.part is None else f", part {result.part}"
     say(
@@ -144,7 +144,7 @@ def _print_summary(result: GenerateResult) -> None:
         speed = f"made {result.new_rows:,} rows in {result.seconds:.1f} s: {result.rows_per_s:,.0f} rows/s"
         compiled = result.setup_seconds > COMPILED_SECONDS
         say(speed + (f" (after {result.setup_seconds:.0f} s of compiling kernels)" if compiled else ""))
-    say(f"{episodes:,} episodes: {outcomes}")
+    say(f"{episodes:,} episodes: {outcomes}" if episodes else "no episodes")
     if result.part is None:
         say(f"next: navrep-data info {result.root}")
     else:

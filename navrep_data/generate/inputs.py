@@ -15,7 +15,7 @@ from navrep_data.generate.policy import DatasetPolicy
 from navrep_data.shards import Manifest
 from navrep_data.sim import GridMap, SimConfig
 from navrep_data.sim.map_tables import map_for_physics
-from navrep_data.sim.maps import load_map
+from navrep_data.sim.maps import is_packaged, load_map
 from navrep_data.sim.scenarios import get_scenario
 
 MAP, POLICY = "map:", "policy"
@@ -122,17 +122,28 @@ def check_unchanged(root: Path, old: Manifest, config: SimConfig, now: Mapping[s
                 f"{root} was made with the origin of map {before!r} at {had}, which {file} puts at {has}: put it back "
                 "to go on with it, or choose another --out."
             )
-    check_policy(root, old, now)
+    _check_policy(root, old, now)
 
 
-def check_policy(root: Path, old: Manifest, now: Mapping[str, str]) -> None:
-    """Make sure that the policy that made a dataset is what it was then.
+def check_inputs(root: Path, old: Manifest, now: Mapping[str, str]) -> None:
+    """Make sure that everything that a dataset was made from is what it was then; maps are called as in its manifest.
 
     Raises
     ------
     DatasetMismatchError
-        If it is not.
+        Naming the first that differs.
     """
+    _check_policy(root, old, now)
+    for name in sorted({*old.inputs, *now}):
+        seen, there = old.inputs.get(name), now.get(name)
+        if seen != there:
+            raise DatasetMismatchError(
+                f"{root} was made from {name} with content {_short(seen)}, which is {_short(there)} here: put the old "
+                "one back to make its sequences again."
+            )
+
+
+def _check_policy(root: Path, old: Manifest, now: Mapping[str, str]) -> None:
     seen, there = old.inputs.get(POLICY), now.get(POLICY)
     if seen != there:
         raise DatasetMismatchError(
@@ -215,6 +226,6 @@ def find_maps(root: Path, manifest: Manifest, config: SimConfig, given: Sequence
 def _places(root: Path, name: str) -> list[str]:
     """Return where a map may be that a manifest calls `name`."""
     path = Path(name)
-    if path.is_absolute():
+    if path.is_absolute() or is_packaged(name):
         return [name]
     return [str(Path(os.path.realpath(root)) / path), str(path.absolute())]

@@ -102,8 +102,12 @@ def merge_manifest(root: Path | str, report: Callable[[str], None] | None = None
     """
     root = Path(root)
     if (root / MANIFEST_FILE).is_file():  # merged before, but perhaps not cleaned up
-        merged = Manifest.read(root)
-        shutil.rmtree(root / PARTS, ignore_errors=True)
+        with writer_lock(root):
+            merged = Manifest.read(root)
+            _check_files(root, merged.shards)
+            if report is not None:
+                report(f"{root} is one dataset already.")
+            shutil.rmtree(root / PARTS, ignore_errors=True)
         return merged
     if not (root / PARTS).is_dir():
         raise DatasetNotFoundError(

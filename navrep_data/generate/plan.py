@@ -264,6 +264,7 @@ def check_same(old: Manifest, request: Request, explicit_shard_size: bool) -> No
         ("scan_dtype", old.scan_dtype, new.scan_dtype),
         ("policy", old.policy.get("name"), new.policy.get("name")),
         ("policy_batch", old.policy.get("batch"), new.policy.get("batch")),
+        ("split_rule", old.split_rule, new.split_rule),
         ("columns", ", ".join(old.columns), ", ".join(new.columns)),
     ]
     # fields at their defaults are left out of stored configs, and older versions did not know all of them

@@ -22,6 +22,8 @@ from navrep_data.sim import (
     SimConfig,
 )
 
+MAX_BATCH = 4096
+
 
 @dataclass(frozen=True)
 class DatasetPolicy:
@@ -73,7 +75,7 @@ def make_policy(policy: AnyPolicy, batch: int) -> DatasetPolicy:
     PolicyError
         If it cannot be imported, or the batch size cannot be used.
     """
-    batch = check_whole("policy_batch", batch, 1, 4096, PolicyError)
+    batch = check_whole("policy_batch", batch, 1, MAX_BATCH, PolicyError)
     if isinstance(policy, str) and policy in SCRIPTED:
         return DatasetPolicy(policy)
     if isinstance(policy, str) and is_path(policy):

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from navrep_data.errors import ConfigError, DatasetError, check_whole
-from navrep_data.generate.inputs import check_policy, find_maps, inputs_of
-from navrep_data.generate.policy import make_policy, make_rollout
+from navrep_data.generate.inputs import check_inputs, find_maps, inputs_of
+from navrep_data.generate.policy import MAX_BATCH, make_policy, make_rollout
 from navrep_data.generate.worker import DatasetSpec, new_writer
 from navrep_data.schema import SCAN_SCALE
 from navrep_data.shards import DatasetFolder, Manifest, ShardEntry, sequence_hash
@@ -94,14 +94,16 @@ def recipe_of(root: Path, manifest: Manifest, maps: Sequence[str] = ()) -> Datas
         manifest.length, manifest.scan_dtype,
         *(name in manifest.columns for name in ("rings", "humans", "scan_label", "contact")),
     )  # fmt: skip
-    name = str(manifest.policy["name"])
-    policy = make_policy(name, int(manifest.policy.get("batch", 1)))
+    name, batch = str(manifest.policy["name"]), manifest.policy.get("batch", 1)
+    if type(batch) is not int or not 1 <= batch <= MAX_BATCH:
+        raise DatasetError(f"{root} says policy.batch is {batch!r}, expected 1 to {MAX_BATCH}; get the manifest again.")
+    policy = make_policy(name, batch)
     if policy.spec is None and policy.to_dict() != manifest.policy:
         raise ConfigError(
             f"{root} was made with policy settings {manifest.policy}, this version has "
             f"{ScriptedPolicy(name).to_dict()}; use the version in its manifest."
         )
-    check_policy(root, manifest, inputs_of(config, policy))
+    check_inputs(root, manifest, inputs_of(config, policy))
     return DatasetSpec(root, config, settings, policy, manifest.seed, manifest.columns, inputs=manifest.inputs)
 
 

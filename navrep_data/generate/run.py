@@ -90,13 +90,13 @@ class Run:
     def _start_over(self, error: CorruptDataError) -> Manifest:
         """Return an empty manifest for a dataset whose own one is lost, if making it again can only restore it.
 
-        Every shard that can still be read must have been made with the settings of this request: then what is
-        written over them are their own bytes.
+        Every shard that can still be read must have been made with the settings, by the policy and from the maps of
+        this request: then what is written over them are their own rows.
         """
         spec = self.request.spec
         if spec.storage is not None or self.request.part is not None:
             raise error  # shards are elsewhere, or others' as well
-        wanted = ShardRecipe(spec.config.env, spec.config.to_dict(), spec.seed, spec.settings.length)
+        wanted = ShardRecipe(spec.config.env, spec.config.to_dict(), spec.seed, spec.settings.length, spec.made_by)
         for path in sorted((self.root / "data").glob("*.h5")):
             try:
                 found = read_recipe(path)

@@ -17,6 +17,7 @@ from navrep_data.generate.policy import DatasetPolicy, make_rollout
 from navrep_data.generate.storage import Store, store_of
 from navrep_data.shards import SPLITS, Ranges, ShardEntry, ShardWriter, count_in_split, nth_of_split, ranges_of
 from navrep_data.shards.entries import shard_file
+from navrep_data.shards.recipe import made_by
 from navrep_data.sim import DrivenRollout, RolloutSettings, ScriptedRollout, SimConfig
 
 
@@ -36,6 +37,11 @@ class DatasetSpec:
     columns: tuple[str, ...]
     storage: str | None = None
     inputs: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def made_by(self) -> str:
+        """What every shard says of policy, inputs and columns, see ``navrep_data/shards/recipe.py``."""
+        return made_by(self.policy.to_dict(), self.inputs, self.settings.scan_dtype, self.columns)
 
     @property
     def store(self) -> Store:
@@ -192,6 +198,7 @@ def new_writer(spec: DatasetSpec, split: str) -> ShardWriter:
         max_humans=spec.config.max_others,
         length=spec.settings.length,
         split=split,
+        made_by=spec.made_by,
     )
 
 

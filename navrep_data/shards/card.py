@@ -7,7 +7,7 @@ from typing import Any
 
 from navrep_data.schema import COLUMNS
 from navrep_data.shards._layout import VECTOR_COLUMNS, Layout, layouts
-from navrep_data.shards.entries import SPLITS, count_of, shard_file
+from navrep_data.shards.entries import SPLITS, count_of, shard_file, shard_pattern
 from navrep_data.shards.manifest import Manifest
 
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
@@ -50,7 +50,7 @@ def _size_category(rows: int) -> str:
 def _data_files(m: Manifest) -> list[str]:
     """Return the files of each split that has any."""
     there = {shard.split for shard in m.shards}
-    lines = [(f"  - split: {name}", f'    path: "data/{name}-*.h5"') for name in SPLITS if name in there]
+    lines = [(f"  - split: {name}", f'    path: "{shard_pattern(name)}"') for name in SPLITS if name in there]
     return [line for pair in lines for line in pair]
 
 

@@ -26,6 +26,7 @@ INDEX_FILE = "index.json"
 _SHARD = r"(?:train|val|test)-[0-9]{5,10}"
 # Names that the format gives to files, apart from those of which a folder has one.
 EXTRA_NAME = re.compile(rf"media/[A-Za-z0-9][\w.-]{{0,99}}\.(?:png|gif)|{re.escape(INDEX_FILE)}")
+SHARD_NAMES = {split: re.compile(rf"data/{split}-[0-9]{{5,10}}\.h5") for split in SPLITS}
 FILE_NAME = re.compile(rf"data/{_SHARD}\.h5|worlds/{_SHARD}\.npz|{EXTRA_NAME.pattern}")
 
 
@@ -34,9 +35,14 @@ def shard_file(split: str, index: int) -> str:
     return f"data/{split}-{index:05d}.h5"
 
 
-def worlds_file(split: str, index: int) -> str:
-    """Return the name of the worlds file of shard `index` of a split inside the dataset folder."""
-    return f"worlds/{split}-{index:05d}.npz"
+def worlds_file(shard: str) -> str:
+    """Return the name of the worlds file beside the shard with this name."""
+    return f"worlds/{shard.removeprefix('data/').removesuffix('.h5')}.npz"
+
+
+def shard_pattern(split: str) -> str:
+    """Return a pattern of the shell for all shards of a split."""
+    return f"data/{split}-*.h5"
 
 
 class SequenceSource(NamedTuple):

@@ -21,8 +21,8 @@ from navrep_data.shards._fields import SHA256, Fields
 from navrep_data.shards._layout import SCAN_DTYPES, column_order
 from navrep_data.shards.entries import (
     EXTRA_NAME,
-    FILE_NAME,
     INDEX_FILE,
+    SHARD_NAMES,
     SPLIT_RULE,
     SPLITS,
     FileEntry,
@@ -32,6 +32,7 @@ from navrep_data.shards.entries import (
     count_of,
     numbers_of,
     split_of,
+    worlds_file,
 )
 from navrep_data.shards.source import parse_datasets, parse_sources
 from navrep_data.shards.statistics import check_statistics, merge_statistics
@@ -40,6 +41,8 @@ MANIFEST_FILE = "manifest.json"
 CARD_FILE = "README.md"
 PARTIAL_FIELDS = ("manifest_sha256", "shards", "sequences", "rows")
 """What the manifest of a copy with some of the shards says of the whole: its hash, and how much it has."""
+# beyond it float64 is infinite
+_MAX_NUMBER = 1e300
 _HASH = re.compile(r"[0-9a-f]{32,64}")
 _LICENSE = re.compile(r"[a-z0-9][a-z0-9.+-]{0,63}")
 
@@ -241,7 +244,7 @@ class Manifest:
         FileAccessError
             If it is not readable.
         SchemaVersionError
-            If it is of a newer format version.
+            If it is of another format version than this one reads.
         CorruptDataError
             If a field has another type or value than the format asks for, or names a file outside the folder.
         """
@@ -344,6 +347,8 @@ def _parse(fields: Fields, root: Path) -> Manifest:
         fields.bad("length", "at least 1")
     if max_humans >= 1 << 16 or (max_humans < 1 and "humans" in columns):
         fields.bad("max_humans", "1 to 65535")
+    if fields.count("shard_size") < 1:
+        fields.bad("shard_size", "at least 1")
     card = fields.values.get("card_sha256")
     source = parse_datasets(fields)
     return Manifest(
@@ -367,7 +372,7 @@ def _parse(fields: Fields, root: Path) -> Manifest:
         ),
         split_rule=fields.get("split_rule", str),
         complete=fields.get("complete", bool),
-        statistics=_parse_statistics(fields, columns),
+        statistics=_parse_statistics(fields, columns, may_be_empty=True),
         command=fields.get("command", str),
         card_sha256=None if card is None else fields.sha256("card_sha256"),
         **_parse_publication(fields, root),
@@ -386,7 +391,7 @@ def _parse_inputs(fields: Fields) -> dict[str, str]:
 def _parse_origins(fields: Fields) -> dict[str, tuple[float, float]]:
     values = fields.get("origins", dict)
     for place in values.values():
-        if not (isinstance(place, list) and len(place) == 2 and all(type(v) in (int, float) for v in place)):
+        if not (isinstance(place, list) and len(place) == 2 and all(map(_is_number, place))):
             fields.bad("origins", "x and y by name")
     return {name: (float(x), float(y)) for name, (x, y) in values.items()}
 
@@ -425,16 +430,21 @@ def check_license(license: Any) -> str:
 def _parse_sensor(fields: Fields) -> SensorContract:
     values = fields.get("sensor", dict)
     names = SensorContract().to_dict()
-    if set(values) != set(names) or any(isinstance(v, bool) or not isinstance(v, int | float) for v in values.values()):
+    if set(values) != set(names) or not all(map(_is_number, values.values())):
         fields.bad("sensor", f"numbers named {', '.join(names)}")
     if not isinstance(values["n_rays"], int) or not 1 <= values["n_rays"] <= 1 << 20 or values["range_max"] <= 0:
         fields.bad("sensor", "n_rays of 1 or more and range_max above 0")
     return SensorContract(**values)
 
 
-def _parse_statistics(fields: Fields, columns: Sequence[str]) -> dict[str, Any]:
+def _is_number(value: Any) -> bool:
+    """Return whether a value is a number that float64 can hold."""
+    return type(value) in (int, float) and abs(value) < _MAX_NUMBER
+
+
+def _parse_statistics(fields: Fields, columns: Sequence[str], may_be_empty: bool = False) -> dict[str, Any]:
     values: dict[str, Any] = fields.get("statistics", dict)
-    problem = check_statistics(values, columns) if values else ""
+    problem = "" if not values and may_be_empty else check_statistics(values, columns)
     if problem:
         raise CorruptDataError(f"{fields.path}: field '{fields.prefix}statistics' {problem}; get the file again.")
     return values
@@ -447,20 +457,20 @@ def _parse_shard(parent: Fields, index: int, root: Path, columns: Sequence[str],
     split = fields.get("split", str)
     if split not in SPLITS:
         fields.bad("split", " or ".join(SPLITS))
-    if not (file.file.startswith(f"data/{split}-") and FILE_NAME.fullmatch(file.file)):
+    if not SHARD_NAMES[split].fullmatch(file.file):
         fields.bad("file", f"data/{split}-, a number and .h5, as files of split {split} are called")
     worlds = None
     if fields.values.get("worlds") is not None:
         beside = Fields(fields.values["worlds"], parent.path, prefix + "worlds.")
         worlds = beside.file(root)
-        expected = f"worlds/{Path(file.file).stem}.npz"
+        expected = worlds_file(file.file)
         if worlds.file != expected:
             beside.bad("file", f"{expected}, beside {file.file}")
     sequences = fields.ranges("sequences")
     count = count_of(sequences)
     hashes = fields.strings("sequence_hashes")
     if len(hashes) != count or not all(SHA256.fullmatch(h) for h in hashes):
-        fields.bad("sequence_hashes", f"{count} hashes of 64 hex digits")
+        fields.bad("sequence_hashes", f"{count} hashes of 64 hex digits, one for each number in `sequences`")
     return ShardEntry(
         file=file.file,
         sha256=file.sha256,

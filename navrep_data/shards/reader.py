@@ -97,7 +97,7 @@ class Shard:
     DatasetNotFoundError
         If there is no such file.
     SchemaVersionError
-        If it is of a newer format version.
+        If it is of another format version than this one reads.
     CorruptDataError
         If it is not a shard, or has links, virtual or external data, references, unknown filters, or columns
         that differ from the format or from `expected`.

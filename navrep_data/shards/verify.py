@@ -111,7 +111,7 @@ def verify(root: Path | str, *, progress: Callable[[int, int], None] | None = No
     DatasetNotFoundError
         If there is no dataset.
     SchemaVersionError
-        If it is of a newer format version.
+        If it is of another format version than this one reads.
     CorruptDataError
         If the manifest itself is damaged, so that nothing can be checked against it.
     FileAccessError

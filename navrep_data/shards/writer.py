@@ -121,10 +121,15 @@ def sequence_hash(columns: Columns) -> str:
 def check_labels(columns: Columns) -> str:
     """Return what is wrong with the labels and contacts of one sequence, or an empty string."""
     if "scan_label" in columns and "humans" in columns:
-        slots, most = columns["humans"].shape[1], int(columns["scan_label"].max())
-        if most >= LABEL_HUMAN + slots:
-            limit = LABEL_HUMAN + slots - 1
-            return f"column 'scan_label' holds {most}, expected at most {limit}: 'humans' has {slots} slots"
+        filled = (~np.isnan(columns["humans"][:, :, 0])).sum(axis=1)  # slots are filled from the first
+        most = columns["scan_label"].max(axis=1)
+        odd = np.flatnonzero(most >= LABEL_HUMAN + filled)
+        if len(odd):
+            row, limit = odd[0], LABEL_HUMAN - 1 + filled[odd[0]]
+            return (
+                f"column 'scan_label' holds {most[row]} in row {row}, expected at most {limit}: 'humans' has "
+                f"{filled[row]} people there"
+            )
     if "contact" in columns and columns["contact"].max() > CONTACT_STATIC:
         return f"column 'contact' holds {int(columns['contact'].max())}, expected 0 to {CONTACT_STATIC}"
     return ""
@@ -191,6 +196,8 @@ class ShardWriter:
         Rows of a sequence; a sequence may have fewer.
     split : str
         The split that all its sequences belong to.
+    made_by : str
+        See :func:`navrep_data.shards.recipe.made_by`; empty where they are not generated.
 
     Raises
     ------
@@ -210,6 +217,7 @@ class ShardWriter:
         max_humans: int,
         length: int,
         split: str,
+        made_by: str = "",
     ) -> None:
         if not 0 <= seed < 1 << 64:
             raise ConfigError(f"seed is {seed}; expected 0 to 2**64 - 1.")
@@ -217,7 +225,7 @@ class ShardWriter:
             raise ConfigError(f"split is {split!r}; expected one of: {', '.join(SPLITS)}.")
         self.layouts = layouts(columns, sensor, scan_dtype, max_humans, length)
         self._env, self._config, self._seed, self._sensor = env, config, seed, sensor
-        self._length, self._split = length, split
+        self._length, self._split, self._made_by = length, split, made_by
         self._rows = 0
         self._numbers: list[int] = []
         self._chunks: dict[str, list[bytes]] = {name: [] for name in self.layouts}
@@ -361,12 +369,14 @@ class ShardWriter:
 
     def _attributes(self) -> dict[str, Any]:
         sensor = self._sensor
+        made_by = {"made_by": self._made_by} if self._made_by else {}
         return {
             "format": FORMAT_NAME,
             "format_version": np.int32(FORMAT_VERSION),
             "env": self._env,
             "config": json.dumps(self._config, allow_nan=False),
             "seed": np.uint64(self._seed),
+            **made_by,
             "split": self._split,
             "first_sequence": np.int64(self._numbers[0]),
             "sequences": np.int64(len(self._numbers)),
@@ -441,7 +451,7 @@ def publish(root: Path | str, index: int, image: ShardImage) -> ShardEntry:
 
 def shard_files(index: int, image: ShardImage) -> list[tuple[str, bytes]]:
     """Return names and contents of a shard's files, in the order in which to write them: worlds first."""
-    worlds = [] if image.worlds is None else [(worlds_file(image.split, index), image.worlds)]
+    worlds = [] if image.worlds is None else [(worlds_file(shard_file(image.split, index)), image.worlds)]
     return [*worlds, (shard_file(image.split, index), image.data)]
 
 
@@ -449,7 +459,7 @@ def shard_entry(index: int, image: ShardImage) -> ShardEntry:
     """Return what the manifest lists of a shard that is in its place."""
     worlds = None
     if image.worlds is not None and image.worlds_sha256 is not None:
-        worlds = FileEntry(worlds_file(image.split, index), image.worlds_sha256, len(image.worlds))
+        worlds = FileEntry(worlds_file(shard_file(image.split, index)), image.worlds_sha256, len(image.worlds))
     return ShardEntry(
         file=shard_file(image.split, index),
         sha256=image.data_sha256,

@@ -28,7 +28,16 @@ from navrep_data.sim._maps import (
 )
 from navrep_data.sim.gridmap import GridMap
 
-__all__ = ["GridMap", "OccupancyRule", "goal_field", "load_map", "map_names", "planning_map", "planning_speeds"]
+__all__ = [
+    "GridMap",
+    "OccupancyRule",
+    "goal_field",
+    "is_packaged",
+    "load_map",
+    "map_names",
+    "planning_map",
+    "planning_speeds",
+]
 
 OccupancyRule = Literal["original", "ros"]
 
@@ -55,6 +64,14 @@ def map_names() -> list[str]:
         If the optional package that they come with is not installed; says the pip command.
     """
     return sorted(path.stem for path in packaged_folder().iterdir() if path.suffix in YAML_SUFFIXES)
+
+
+def is_packaged(name: str) -> bool:
+    """Return whether a bare word names one of the paper's maps that are installed here."""
+    try:
+        return is_bare(name) and name in map_names()
+    except MissingExtraError:
+        return False
 
 
 def load_map(name_or_path: str | os.PathLike[str], *, occupancy: OccupancyRule | None = None) -> GridMap:

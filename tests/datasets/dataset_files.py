@@ -45,7 +45,7 @@ def make_sequence(
     values = {
         "scan": scan,
         "rings": scan_to_rings(scan),
-        "scan_label": rng.integers(0, 3 + H, scan.shape),
+        "scan_label": rng.integers(0, 3 + H - 1, scan.shape),  # the last slot is empty
         "robot_state": state,
         "action": action,
         "reward": reward,

@@ -9,6 +9,7 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,8 @@ def make(name: str, root: Path) -> dict[str, list[str]]:
     options = dict(options)
     policy = options.pop("policy", "orca")
     spec = make_policy(half_speed if policy == "half_speed" else policy, 2)
+    if spec.spec is not None:  # neither this file's content nor how it is imported is to count
+        spec = replace(spec, name=policy, spec=replace(spec.spec, files={}))
     rows = {"scan_dtype": None, "rings": True, "humans": True, "labels": False} | options
     config = make_config(env, curriculum="constant", **fields)
     request = make_request(root, config, check_settings(config, LENGTH, **rows), spec, SEED, SEQUENCES, 8)

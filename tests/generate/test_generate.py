@@ -166,13 +166,18 @@ def test_a_cut_manifest_is_made_again(reference, tmp_path, cut):
     assert tree(root) == reference[2]
 
 
-def test_a_cut_manifest_over_other_data_is_refused(reference, tmp_path):
+@pytest.mark.parametrize(
+    "other",
+    [{"seed": 6}, {"policy": "goal-momentum"}, {"policy": "goal"}, {"labels": True}, {"scan_dtype": "float32"}],
+    ids=str,
+)
+def test_a_cut_manifest_over_other_data_is_refused(reference, tmp_path, other):
     root = tmp_path / "d"
     shutil.copytree(reference[0], root)
     (root / "manifest.json").write_bytes(b"{")
     before = tree(root)
     with pytest.raises(CorruptDataError, match="not valid JSON"):
-        generate(**{**SMALL, "n": 7, "out": root, "seed": 6})
+        generate(**{**SMALL, "n": 7, "out": root, **other})
     assert tree(root) == before
 
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import hashlib
 import pickle
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from navrep_data.errors import DatasetMismatchError, MapError
+from navrep_data.datasets.tools import merge
+from navrep_data.errors import DatasetError, DatasetMismatchError, MapError
 from navrep_data.generate import generate, merge_manifest, regenerate
 from navrep_data.generate.inputs import check_here, inputs_of
 from navrep_data.generate.policy import make_policy
@@ -22,7 +24,7 @@ from navrep_data.sim.map_tables import map_world_data
 SETTINGS = {"env": "map", "humans": 0, "length": 4, "shard_size": 1, "rings": False}
 
 
-def draw(folder: Path, wall: int = 0) -> None:
+def draw(folder: Path, wall: int = 0, origin: int = 0) -> None:
     """Write a map of 5 x 4 m; with a wall of so many cells."""
     grey = np.full((40, 50), 254, np.uint8)
     grey[[0, -1], :] = grey[:, [0, -1]] = 0
@@ -30,7 +32,8 @@ def draw(folder: Path, wall: int = 0) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     Image.fromarray(grey).save(folder / "map.png")
     (folder / "map.yaml").write_text(
-        "image: map.png\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
+        f"image: map.png\nresolution: 0.1\norigin: [{origin}, 0, 0]\nnegate: 0\n"
+        "occupied_thresh: 0.65\nfree_thresh: 0.196\n",
         encoding="utf-8",
     )
 
@@ -142,3 +145,53 @@ def test_a_config_reads_its_maps_from_where_they_were(here: Path, monkeypatch: p
         assert map_world_data(other).maps[0].hash == expected
     assert config == make_config("map", maps=("./m",), humans=0), "where a map is read from is no setting"
     assert "map_files" not in config.full_dict()
+
+
+def edit(root: Path, **values: object) -> None:
+    """Change fields of a manifest that stays one in itself."""
+    manifest = Manifest.read(root)
+    replace(manifest, **values).save(root)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("maps")
+@pytest.mark.parametrize("settings", [{"env": "crowdmove-1"}, {"env": "map", "maps": ["crowdmove1"]}, {"env": "ian"}])
+def test_datasets_on_the_papers_maps_are_proved_and_their_maps_compared(settings: dict, tmp_path: Path) -> None:
+    root = tmp_path / "d"
+    generate(n=1, out=root, length=5, rings=False, **settings)
+    assert regenerate(root, 1).ok
+    known = Manifest.read(root).inputs
+    name = sorted(known)[0]
+    edit(root, inputs={**known, name: "0" * 32})
+    with pytest.raises(DatasetMismatchError, match=r"has been edited|was made from"):
+        regenerate(root, 1)
+    edit(root, inputs={**known, "map:elsewhere": "0" * 32})
+    with pytest.raises(DatasetMismatchError, match=r"was made from map:elsewhere with content 0000.*unknown here"):
+        regenerate(root, 1)
+
+
+@pytest.mark.slow
+def test_what_a_merged_dataset_was_made_from_stays_known(here: Path) -> None:
+    """Two maps of one name, apart in content and place."""
+    generate(n=1, out="../d", maps=["./m"], **SETTINGS)
+    draw(here / "a" / "m", wall=9, origin=7)
+    generate(n=1, out="../e", maps=["./m"], seed=1, **SETTINGS)
+    merge(["../d", "../e"], "../both")
+    one, other, both = (Manifest.read(here / name) for name in ("d", "e", "both"))
+    assert (both.inputs, both.origins) == ({}, {})
+    assert [r["inputs"] for r in both.source] == [one.inputs, other.inputs]
+    assert [r["origins"] for r in both.source] == [{}, {"map:../a/m": [7.0, 0.0]}]
+    assert one.inputs != other.inputs
+
+
+def test_a_manifest_whose_rule_of_splits_or_batch_is_another_is_not_gone_on_with(tmp_path: Path) -> None:
+    root = tmp_path / "d"
+    settings = {"humans": 1, "length": 4, "out": root, "rings": False, "policy": "goal", "policy_batch": 2}
+    generate(n=1, **settings)
+    edit(root, split_rule="as I like")
+    with pytest.raises(DatasetMismatchError, match="was made with split_rule=as I like, asked for split_rule=sequence"):
+        generate(n=2, **settings)
+    for batch in ("x", 0, None, [2], True):
+        edit(root, policy={"name": "goal", "batch": batch})
+        with pytest.raises(DatasetError, match=r"says policy\.batch is .*, expected 1 to 4096"):
+            regenerate(root, 1)

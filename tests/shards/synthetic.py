@@ -44,11 +44,12 @@ def make_sequence(
         humans[mine, :n, :4] = rng.normal(size=(mine.sum(), n, 4))
         humans[mine, :n, 4] = rng.uniform(0.3, 0.5, n)
         humans[mine, :n, 5] = rng.random((mine.sum(), n)) < 0.5
+    people = per_episode[episode][:, None]
     pose = np.cumsum(rng.normal(0, 0.1, (rows, 3)), axis=0).astype(np.float32)
     table = {
         "scan": scan,
         "rings": scan_to_rings(scan),
-        "scan_label": np.repeat(rng.integers(0, LABEL_HUMAN + MAX_HUMANS, (rows, 27)), 40, axis=1).astype(np.uint8),
+        "scan_label": np.repeat(rng.integers(0, LABEL_HUMAN + people, (rows, 27)), 40, axis=1).astype(np.uint8),
         "robot_state": rng.normal(size=(rows, 5)).astype(np.float32),
         "action": np.where(last[:, None], 0, rng.uniform(-1, 1, (rows, 3))).astype(np.float32),
         "reward": np.where(last, 0, rng.normal(size=rows)).astype(np.float32),

@@ -317,7 +317,11 @@ def test_hostile_files_are_refused(shard_file, change, match):
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("scan_label", LABEL_HUMAN + MAX_HUMANS, f"'scan_label' holds {LABEL_HUMAN + MAX_HUMANS}, expected at most"),
+        (
+            "scan_label",
+            LABEL_HUMAN + MAX_HUMANS,
+            f"'scan_label' holds {LABEL_HUMAN + MAX_HUMANS} in row 0, expected at most",
+        ),
         ("contact", 4, "'contact' holds 4, expected 0 to 3"),
     ],
 )

@@ -196,6 +196,8 @@ def _record(folder: DatasetFolder) -> dict[str, Any]:
         "versions": m.versions,
         "command": m.command,
         "config": m.config,
+        "inputs": dict(m.inputs),
+        "origins": {name: list(place) for name, place in m.origins.items()},
     }
 
 
