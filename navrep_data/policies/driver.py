@@ -34,10 +34,11 @@ class Driver:
     """
 
     def __init__(self, policy: BasePolicy) -> None:
+        self.policy = policy
+        self._name = policy.name or type(policy).__name__
         unknown = sorted(policy.needs - NEEDS)
         if unknown:
-            raise PolicyError(f"Policy {policy.name!r} needs {unknown[0]!r}, expected: {', '.join(sorted(NEEDS))}.")
-        self.policy = policy
+            raise PolicyError(f"Policy {self._name!r} needs {unknown[0]!r}, expected: {', '.join(sorted(NEEDS))}.")
 
     def start(self, simulator: Simulator) -> None:
         """Tell the policy where it drives; its memory begins anew.
@@ -51,7 +52,7 @@ class Driver:
         beyond = sorted(self.policy.needs - OF_EVERY_ROBOT)
         if config.robots > 1 and beyond:
             raise PolicyError(
-                f"Policy {self.policy.name!r} needs {beyond[0]}, which worlds with one robot offer, but here are "
+                f"Policy {self._name!r} needs {beyond[0]}, which worlds with one robot offer, but here are "
                 f"{config.robots}; take another policy, or robots=1."
             )
         self.policy.start(Context(robot_contract(config), config.sensor, simulator.grids()))
@@ -92,11 +93,10 @@ class Driver:
         shares = np.asarray(self.policy.act(observe(simulator, self.policy.needs, seen)), np.float64)
         if shares.shape != (rows, ACTION_SIZE):
             raise PolicyError(
-                f"Policy {self.policy.name!r} returned shape {shares.shape}, expected ({rows}, 3): vx, vy, omega in "
-                "[-1, 1]."
+                f"Policy {self._name!r} returned shape {shares.shape}, expected ({rows}, 3): vx, vy, omega in [-1, 1]."
             )
         if not np.isfinite(shares).all():
-            raise PolicyError(f"Policy {self.policy.name!r} returned NaN or infinity, expected numbers in [-1, 1].")
+            raise PolicyError(f"Policy {self._name!r} returned NaN or infinity, expected numbers in [-1, 1].")
         if mask is not None:
             shares = np.where(mask[:, None], shares, 0.0)
         steered = self.policy.steers and config.drive == "differential"

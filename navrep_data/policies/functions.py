@@ -124,13 +124,20 @@ def load_attribute(name: str) -> Any:
         found: Any = importlib.import_module(module_name)
         for part in attribute.split("."):
             found = getattr(found, part)
-    except (ImportError, AttributeError, ValueError) as error:
+    except Exception as error:  # somebody's module: anything may be wrong in it
+        said = str(error) if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: {error}"
         raise PolicyError(
-            f"Policy {name!r} cannot be imported ({error}). Expected module:function, importable from {here}, or one "
+            f"Policy {name!r} cannot be imported ({said}). Expected module:function, importable from {here}, or one "
             f"of: {', '.join(BASELINES)}."
         ) from error
     if isinstance(found, type):
-        found = found()
+        try:
+            found = found()
+        except TypeError as error:
+            raise PolicyError(
+                f"Policy {name!r} cannot be made ({error}), expected a class that takes no arguments: give its "
+                "settings defaults, or name an object that your module makes of it."
+            ) from error
     if not callable(found) and not hasattr(found, "act"):
         raise PolicyError(
             f"Policy {name!r} is a {type(found).__name__}, expected a callable (scan, robot_state), or an object with "

@@ -90,7 +90,8 @@ class BasePolicy(ABC):
     name : str
         Full name, as results and datasets record it.
     sees : str
-        What it is given beside the goal and its own velocity, in a few words: ``"scan"``, ``"true humans"``.
+        What it is given beside the goal and its own velocity, in a few words: ``"scan"``, ``"true humans"``; its
+        `needs` where it is empty.
     sees_on_maps : str
         The same in worlds on maps, empty where it does not differ.
     text : str
@@ -107,8 +108,8 @@ class BasePolicy(ABC):
         own row whether or not the others are played.
     """
 
-    name: str
-    sees: str
+    name: str = ""
+    sees: str = ""
     sees_on_maps: str = ""
     text: ClassVar[str] = ""
     needs: frozenset[str] = frozenset()

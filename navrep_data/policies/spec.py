@@ -220,7 +220,8 @@ def _scaling(ranges: str, scaling: str | None) -> str:
 
 
 def _from_class(name: str, policy: Any, on_maps: bool, kind: str) -> PolicySpec:
-    return PolicySpec(name, (on_maps and policy.sees_on_maps) or policy.sees, name, kind)
+    sees = (on_maps and policy.sees_on_maps) or policy.sees or ", ".join(sorted(policy.needs)) or "goal only"
+    return PolicySpec(name, sees, name, kind)
 
 
 def _from_object(name: str, found: Any, on_maps: bool, ranges: str, scaling: str | None) -> PolicySpec:

@@ -31,6 +31,15 @@ class Asked:
     def act(self, scan, robot_state):
         return np.tile([0.5, 0.0], (len(scan), 1))
 
+class Picky(Asked):
+    def __init__(self, speed):
+        self.speed = speed
+
+class Plain(BasePolicy):
+    needs = frozenset({"scan", "pose"})
+    def act(self, observation):
+        return np.zeros((len(observation.pose), 3))
+
 number = 3
 """
 
@@ -60,6 +69,7 @@ def test_kinds(own):
     assert isinstance(found["my_drives:slowly"].make(2), FunctionPolicy)
     assert type(found["my_drives:Ahead"].make()).__name__ == "Ahead"
     assert resolve_policy("my_drives:Ahead", on_maps=True).sees == "its goal, map"
+    assert resolve_policy("my_drives:Plain").sees == "pose, scan"
     assert resolve_policy("orca", on_maps=True).sees == "true humans, map"
 
 
@@ -92,6 +102,13 @@ def test_refusals_are_the_same_everywhere(parse, own):
         parse("my_drives:nobody")
     with pytest.raises(PolicyError, match=r"Policy 'my_drives:number' is a int, expected a callable"):
         parse("my_drives:number")
+    with pytest.raises(
+        PolicyError, match=r"'my_drives:Picky' cannot be made .*'speed'.*a class that takes no arguments"
+    ):
+        parse("my_drives:Picky")
+    (own / "broken_drives.py").write_text("1 / 0\n")
+    with pytest.raises(PolicyError, match=r"cannot be imported \(ZeroDivisionError: division by zero\)"):
+        parse("broken_drives:drive")
     with pytest.raises(PolicyError, match=r"policy is 3, expected a name, a function"):
         parse(3)
 
