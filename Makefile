@@ -38,7 +38,7 @@ format: $(STAMP)  ## Format and fix what can be fixed.
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-KERNEL_TESTS := tests/sim tests/observations
+KERNEL_TESTS := tests/sim tests/observations tests/policies
 
 test-nojit: $(STAMP)  ## Run the kernel tests as plain Python.
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) --numprocesses $(JOBS) $(PYTEST_ARGS)

@@ -13,17 +13,17 @@ POLYGONS = [
     ("soadrl", {"robots": 3, "humans": 4}),
 ]
 MAPS = [
-    ("ian", {"physics": "consistent"}),
-    ("ian", {"physics": "original"}),
+    # its three large maps take two minutes without compiled kernels
+    pytest.param("ian", {"physics": "consistent"}, marks=pytest.mark.slow),
+    pytest.param("ian", {"physics": "original"}, marks=pytest.mark.slow),
     ("map", {"maps": ["asl"], "humans": 5}),
     ("map", {"maps": ["asl"], "humans": 5, "robots": 2}),
 ]
 
 
-@pytest.fixture(params=[*POLYGONS, *MAPS], ids=str)
-def moved(request, maps):
+@pytest.fixture
+def moved(env, settings, maps):
     """A simulator whose robots have moved, and their present states."""
-    env, settings = request.param
     sim = Simulator(make_config(env, **settings), n_worlds=3, seed=2)
     shape = sim.robot_states().shape[:-1]
     for _ in range(4):
@@ -31,6 +31,7 @@ def moved(request, maps):
     return sim, [sim.state(w) for w in range(3)]
 
 
+@pytest.mark.parametrize(("env", "settings"), [*POLYGONS, *MAPS])
 def test_poses_goals_and_radii_are_those_of_the_states(moved):
     sim, states = moved
     lead = (3, sim.config.robots) if sim.config.robots > 1 else (3,)
@@ -42,6 +43,7 @@ def test_poses_goals_and_radii_are_those_of_the_states(moved):
     assert np.array_equal(sim.poses(), robots[..., :3])
 
 
+@pytest.mark.parametrize(("env", "settings"), [*POLYGONS, *MAPS])
 def test_humans_are_those_of_the_states(moved):
     sim, states = moved
     counts, motions = sim.human_counts(), sim.human_motions()
@@ -51,6 +53,7 @@ def test_humans_are_those_of_the_states(moved):
         assert np.isnan(motions[w, counts[w] :]).all()
 
 
+@pytest.mark.parametrize(("env", "settings"), [*POLYGONS, *MAPS])
 def test_gaps_are_those_to_the_nearest(moved):
     sim, states = moved
     to_agent, to_static = sim.gaps()
@@ -68,18 +71,18 @@ def test_gaps_are_those_to_the_nearest(moved):
             assert min(to_static[w], 1.0) <= min(static, 1.0) + 1e-6
 
 
-def test_gaps_before_the_first_step(maps):
-    for env, settings in (*POLYGONS, *MAPS):
-        sim = Simulator(make_config(env, **settings), n_worlds=2, seed=3)
-        to_agent, to_static = sim.gaps()
-        for w in range(2):
-            state = sim.state(w)
-            x, y, radius = state.robot[[0, 1, 5]]
-            others = np.concatenate([state.humans[:, [0, 1, 7]], state.robots[1:, [0, 1, 5]]])
-            agent = (np.hypot(others[:, 0] - x, others[:, 1] - y) - others[:, 2]).min(initial=np.inf) - radius
-            static = sim.clearance([[x, y]], w)[0] - radius
-            assert to_agent[w] == pytest.approx(agent, abs=1e-9)
-            assert min(to_static[w], 1.0) == pytest.approx(min(static, 1.0), abs=1e-6)
+@pytest.mark.parametrize(("env", "settings"), [*POLYGONS, *MAPS])
+def test_gaps_before_the_first_step(env, settings, maps):
+    sim = Simulator(make_config(env, **settings), n_worlds=2, seed=3)
+    to_agent, to_static = sim.gaps()
+    for w in range(2):
+        state = sim.state(w)
+        x, y, radius = state.robot[[0, 1, 5]]
+        others = np.concatenate([state.humans[:, [0, 1, 7]], state.robots[1:, [0, 1, 5]]])
+        agent = (np.hypot(others[:, 0] - x, others[:, 1] - y) - others[:, 2]).min(initial=np.inf) - radius
+        static = sim.clearance([[x, y]], w)[0] - radius
+        assert to_agent[w] == pytest.approx(agent, abs=1e-9)
+        assert min(to_static[w], 1.0) == pytest.approx(min(static, 1.0), abs=1e-6)
 
 
 @pytest.mark.parametrize("robots", [1, 3])
@@ -105,6 +108,7 @@ def test_orca_velocities_are_those_of_orca_for_everybody(robots):
         np.testing.assert_allclose(found[w], expected[0], atol=2e-4)
 
 
+@pytest.mark.parametrize(("env", "settings"), [*POLYGONS, *MAPS])
 def test_waypoints_lie_ahead_on_maps_and_at_the_goal_elsewhere(moved, maps):
     sim, states = moved
     points = sim.waypoints()
