@@ -161,12 +161,7 @@ def benchmark(
     if address is not None and executor != "ray":
         raise ConfigError(f"address is {address}, which only Ray needs; expected executor ray with it.")
     total = chosen.total(episodes, first_round)
-    specs = list(
-        {
-            s.name: s
-            for s in (resolve_policy(p, source, inference, bool(chosen.maps), ranges, scaling) for p in policies)
-        }.values()
-    )
+    specs = _one_each([resolve_policy(p, source, inference, bool(chosen.maps), ranges, scaling) for p in policies])
     specs = [s if s.is_network else _plain(s) for s in specs]
     everybody = specs if any(s.name == "goal" for s in specs) else [resolve_policy("goal"), *specs]
     folder = Path(out) / chosen.folder(kind, first_round)
@@ -190,6 +185,18 @@ def benchmark(
     report.files = [*(folder / file_name(s) for s in everybody), *report.files]
     report.seconds = seconds
     return report
+
+
+def _one_each(specs: Sequence[PolicySpec]) -> list[PolicySpec]:
+    """Return each policy once; two that are not the same cannot share a name, since results go by it."""
+    found: dict[str, PolicySpec] = {}
+    for spec in specs:
+        if found.setdefault(spec.name, spec).given is not spec.given:
+            raise ConfigError(
+                f"Two policies are called {spec.name}, expected a name for each: results go by it; play them in two "
+                "folders (out=), or write a class or function for each."
+            )
+    return list(found.values())
 
 
 def _plain(spec: PolicySpec) -> PolicySpec:

@@ -34,7 +34,7 @@ class ShardRecipe:
     length : int
         Rows of a sequence.
     made_by : str
-        See :func:`made_by`; empty where a shard was not generated.
+        See ``made_by`` in this module; empty where a shard was not generated.
     """
 
     env: str

@@ -197,7 +197,7 @@ class ShardWriter:
     split : str
         The split that all its sequences belong to.
     made_by : str
-        See :func:`navrep_data.shards.recipe.made_by`; empty where they are not generated.
+        See ``navrep_data/shards/recipe.py``; empty where they are not generated.
 
     Raises
     ------

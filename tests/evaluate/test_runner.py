@@ -261,3 +261,10 @@ def test_a_policy_is_named_by_its_folder(tmp_path, monkeypatch):
 
 def paths(report):
     return Results.load(next(f for f in report.files if "mine" in f.name)).trajectories
+
+
+def test_two_policies_of_one_name_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"Two policies are called navrep_data\.policies\.baselines:GoalPolicy"):
+        benchmark([GoalPolicy(), GoalPolicy()], episodes=1, out=tmp_path)
+    one = GoalPolicy()
+    assert len(benchmark([one, one, "goal"], episodes=1, out=tmp_path, figures=False).rows) == 2

@@ -122,6 +122,7 @@ def test_waypoints_lie_ahead_on_maps_and_at_the_goal_elsewhere(moved, maps):
             assert sim.grid(w).name in maps
 
 
+@pytest.mark.slow
 def test_scenarios_played(maps):
     sim = Simulator(make_config("ian"), n_worlds=2)
     sim.reset_scenarios([3, 20])
